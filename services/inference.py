@@ -233,7 +233,7 @@ class Inference(Stage):
         """
         last = self._last
         if last is not None and self._last_scan == frame.reconstructed and self._surer is not None and last.image.size:
-            self._shows_surer(frame, last, out)
+            self._shows_surer(last, out)
         elif last is not None and self._last_scan == frame.reconstructed:
             out.noise, out.residual = last.noise, last.residual
             self._shows_again(last, out)
@@ -243,7 +243,7 @@ class Inference(Stage):
             out.reasons.append("gap")
             self._counters["missed"] += 1
 
-    def _shows_surer(self, frame: DeltaFrame, last: ImageFrame, out: ImageFrame) -> None:
+    def _shows_surer(self, last: ImageFrame, out: ImageFrame) -> None:
         """A better image of the scan that is held takes its place: it is a new one to readers."""
         assert self._surer is not None
         out.image, out.sigma, out.classes = self._surer

@@ -32,7 +32,6 @@ from services.estimation.values.estimate import Estimate, TouchEstimate
 from services.estimation.values.judgement import Judgement
 from services.estimation.values.scan import Scan
 from services.judged import judged
-from services.kept_baseline import ages
 from services.linearisation import Linearisation
 from services.runtime.config import Skin
 from services.runtime.continuity import Continuity
@@ -40,6 +39,7 @@ from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason,
 
 Array = NDArray[np.float64]
 
+LONGEST_S = 1e9  # an age that is longer is none
 SAVE_EVERY = 512  # untouched scans after which the tracked baseline is worth keeping again
 PLACE_SIGMA = 1e-4  # m: no table knows a place better
 MOST_LOG = 3.0  # of |Z| over the baseline: no image is made of what is larger, no touch does it
@@ -384,7 +384,7 @@ class Preprocessing(Stage):
             return None
         self._keep = False
         taken_s = self._undated_s or max(0.0, (self._sample_ns - baseline.taken_ns) * 1e-9)
-        return {"bundle": self.bundle.hash, "baseline": baseline.to_dict(), "taken_s": taken_s, "quiet_s": 0.0}
+        return {"bundle": self.bundle.hash, "baseline": baseline.to_dict(), "taken_s": taken_s}
 
     def restore(self, saved: dict[str, Any], age_s: float) -> None:
         if self.config.tare.calibrate and self.linearisation.restore(saved):
@@ -400,7 +400,9 @@ class Preprocessing(Stage):
             raise Refused("the saved baseline is of another bundle")
         baseline = Baseline.from_dict(saved.get("baseline", {}), len(self.bundle.pattern))
         oldest_s = self.config.tare.max_age_s
-        taken_s, quiet_s = ages(saved)
+        taken_s = saved.get("taken_s", 0.0)  # before it was kept
+        if not isinstance(taken_s, int | float) or not 0 <= taken_s <= LONGEST_S:
+            raise Refused(f"the saved baseline has no age (found {taken_s!r:.40}): tare again")
         if age_s > oldest_s:
             self._trust(None if baseline.doubt else baseline)
             self._undated_s = age_s + taken_s
@@ -408,7 +410,7 @@ class Preprocessing(Stage):
                 f"the saved baseline is {age_s / 3600:.1f} h old, at most {oldest_s / 3600:.1f} h: another is taken, "
                 "and held against it"
             )
-        self.set_baseline(replace(baseline, restored=True), age_s + quiet_s)
+        self.set_baseline(replace(baseline, restored=True), age_s)
         self._undated_s = age_s + taken_s
 
     def state(self) -> dict[str, Any]:

@@ -131,7 +131,7 @@ class Publishing(Stage):
         self._watch(frame.stamps.get("sample", 0))
         if out.valid or not SAYS_NOTHING & set(out.reasons):
             out.contacts = self._contacts(frame, out)
-            self._note(frame, out)
+            self._note(out)
         else:
             self._watched = False
             self._counters["unknown"] += 1
@@ -268,7 +268,7 @@ class Publishing(Stage):
         self._drops[number] = touch.drop - 3 * touch.drop_sigma
         return self._writer.of_estimate(number, state, touch, looks)
 
-    def _note(self, frame: ImageFrame | PartFrame, out: ContactFrame) -> None:
+    def _note(self, out: ContactFrame) -> None:
         """What to know of these contacts."""
         if any((c.force_n or 0.0) > self.law.most_n or self.law.saturates(c.pressure_pa) for c in out.contacts):
             add_reason(out.reasons, "extrapolated")

@@ -27,7 +27,7 @@ BRIDGES_NEED["ros2"] |= {"std_srvs"}
 BRIDGES_NEED |= {"foxglove": {"foxglove", "aiohttp"}, "export": {"rosbags", "foxglove", "rerun"}}
 OFFLINE_DOORS = "services.cli"  # the command line hands over to the offline tools on demand
 SERVICES_USE_OF_MODELS = {*"bundle calibration_file files locator locator_arrays measurement npz patterns".split()}
-SERVICES_USE_OF_MODELS |= {*"prereconstruction pressure rolling shapes symmetries touch_grid turns".split()}
+SERVICES_USE_OF_MODELS |= {*"prereconstruction pressure rolling shapes symmetries turns".split()}
 # What services/estimation may import of the project
 NUMERICS = ("models", "services.estimation", "protocol.frames", "protocol.frame_types", "protocol.errors")
 # Rooms of the estimator, each of which stands on those before it, on values and on models/measurement

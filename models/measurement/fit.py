@@ -106,7 +106,6 @@ class FoundTouches:
     left: Array  # (K,) residual
     design: Array  # (K, N) whitened slopes of all that was solved for
     solved: Array  # (N, N) its posterior covariance
-    size: float  # |m|
     steps: int
     known: KnownWhitening
     turned: Turned
@@ -383,7 +382,6 @@ class TouchFitter:
             left=left,
             design=point.design,
             solved=linear.solved,
-            size=self._size2(point.columns) ** 0.5,
             steps=self.steps,
             known=self._known,
             turned=self._turned,

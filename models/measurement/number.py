@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from types import ModuleType
 from typing import Self
 
 
@@ -22,16 +20,3 @@ class Number(float):
     def __reduce__(self) -> tuple[type[Self], tuple[float, str, str, str]]:
         """What a copy is made of."""
         return type(self), (float(self), self.unit, self.meaning, self.origin)
-
-
-def numbers_of(module: ModuleType) -> Iterator[tuple[str, Number]]:
-    """Name and number of each in a module, in the order of the file."""
-    for name, value in vars(module).items():
-        if isinstance(value, Number):
-            yield name, value
-
-
-def table(*modules: ModuleType) -> str:
-    """The numbers of some modules as lines of text: name, value, unit, meaning, origin."""
-    rows = [(name, f"{each:g}", each.unit, each.meaning, each.origin) for m in modules for name, each in numbers_of(m)]
-    return "\n".join(dict.fromkeys("  ".join(row) for row in rows))  # a module may lend from one before it

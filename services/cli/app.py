@@ -18,6 +18,7 @@ from services.cli import (
     bridge,
     calibrate,
     collect,
+    dev,
     export,
     golden,
     info,
@@ -71,6 +72,7 @@ def _of_all_commands(
 
 for group in (service, watch, board, recordings, info, golden, export, calibrate, bridge, collect, new_skin, offline):
     group.register(app)
+dev.register(app)
 
 
 def _with_values(of: typer.Typer) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,8 @@ from services.estimation.asked.question import (
     StepBudget,
 )
 from services.estimation.faults import advice
-from services.estimation.faults.asking import Asked, AskedScan
-from services.estimation.faults.board import BoardView
+from services.estimation.faults.asking import Asked
+from services.estimation.faults.board import AskedScan, BoardView
 from services.estimation.faults.wires import WireFault
 from services.estimation.filter import Prediction
 from services.estimation.first.tare import (
@@ -53,7 +53,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 19  # of a kept state
+LAYOUT = 20  # of a kept state
 
 
 @dataclass
@@ -64,16 +64,21 @@ class EstimatorState:
     whole_us: float = -np.inf  # board's clock at the end of the last whole scan
     wholes: int = 0  # whole scans since the tare
     unexplained_s: float = 0.0  # for how long nothing has explained the scans
-    information: Annotated[NDArray[np.float32] | None, "A"] = None  # of the grid's discs
-    informed: int = 0  # `wholes` then
-    informed_live: Annotated[NDArray[np.bool_], "L"] = field(default_factory=lambda: np.zeros(0, bool))
-    informed_wire: WireFault | None = None
     noticed: bool = False  # the part before was the first that was not quiet, and was not asked about
     candidates: list[OpenTouch] = field(default_factory=list)
     said: tuple[TouchEstimate, ...] = ()
     said_ns: int = 0  # `sample` for which that was
     adopted_age_s: float | None = None  # of a baseline that was adopted, before the next scan
     trusted: KnownBaseline | None = None  # too old to go on from: it tells what touches the first scans
+
+
+class GridInformation(NamedTuple):
+    """Of the grid's discs, made now and then and under other wires or measurements."""
+
+    each: NDArray[np.float32]  # (A,)
+    wholes: int  # EstimatorState.wholes then
+    live: NDArray[np.bool_]
+    wire: WireFault | None
 
 
 @dataclass
@@ -94,6 +99,7 @@ class Estimator:
         self.now = EstimatorState()
         self.taring = Taring(tables, tare_scans)
         self.skin: TaredSkin | None = None
+        self._information: GridInformation | None = None
 
     def tare(self, force: bool = False) -> AgreedScans:
         """Take the latest scans for the untouched skin: these. Raises TareRefused, while something touches unless
@@ -126,7 +132,7 @@ class Estimator:
         """Of the same skin from the next scan on, as a calibration of its mounting knows it; while nothing touches."""
         self._tables = tables
         self.taring.use(tables)
-        self.now.information = None
+        self._information = None
         if self.skin is not None:
             self.skin = self.skin.with_tables(tables)
 
@@ -140,10 +146,10 @@ class Estimator:
         which contact impedances of this skin change.
         """
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
-        self.skin = TaredSkin(self._tables, baseline.log_z0, baseline.live, baseline.scatter, baseline.frames)
+        self.skin = TaredSkin(self._tables, baseline)
         age_s = min(max(age_s, 0.0), float(n.OLDEST_S))
         self.skin.adopt(next_id, contact_per_s, age_s)
-        self.now = EstimatorState(adopted_age_s=age_s)
+        self.now, self._information = EstimatorState(adopted_age_s=age_s), None
         self.taring.adopted(baseline.doubt)
 
     def trust(self, baseline: KnownBaseline | None) -> None:
@@ -152,10 +158,11 @@ class Estimator:
 
     def _begin(self, scans: AgreedScans, wire: WireFault | None = None) -> None:
         next_id = 1 if self.skin is None else self.skin.touches.now.next_id
-        self.skin = TaredSkin(self._tables, scans.log_z0, scans.live, scans.scatter, len(scans.residuals))
+        baseline = KnownBaseline(scans.log_z0, scans.live, scans.scatter, len(scans.residuals))
+        self.skin = TaredSkin(self._tables, baseline)
         self.skin.begin(scans, next_id)
         self.skin.faults.now.wire = wire
-        self.now.information, self.now.wholes, self.now.unexplained_s = None, 0, 0.0
+        self._information, self.now.wholes, self.now.unexplained_s = None, 0, 0.0
         self.now.trusted = None
 
     def _first(self) -> None:
@@ -171,7 +178,7 @@ class Estimator:
 
     def state(self) -> dict[str, Any]:
         """All that changes, to be kept; who loads it goes on bit by bit as this one does."""
-        self.now.information = None  # as whitenings of a moment ago
+        self._information = None  # as whitenings of a moment ago
         tared = None if self.skin is None else self.skin.state()
         return {"layout": LAYOUT, **saved(WholeState(self.now, self.taring.now, self.taring.latest.now, tared))}
 
@@ -189,10 +196,10 @@ class Estimator:
         known = loaded(WholeState, {name: value for name, value in state.items() if name != "layout"}, sizes)
         skin = None
         if known.tared is not None:
-            tared = known.tared
-            skin = TaredSkin(self._tables, tared.log_z0, tared.live, tared.scatter, tared.frames)
-            skin.load(tared)
+            skin = TaredSkin(self._tables, known.tared.baseline)
+            skin.load(known.tared)
         self.skin, self.now, self.taring.now, self.taring.latest.now = skin, known.scans, known.taring, known.latest
+        self._information = None
 
     # --- one scan ---
 
@@ -247,15 +254,14 @@ class Estimator:
 
     def _glanced(self, skin: TaredSkin, measured: LookedAt) -> Seen | None:
         """What a first look sees where nothing touched before; None where it cannot tell."""
-        now, scan = self.now, measured.scan
-        oldest_s = measured.oldest_s
-        may = not len(skin.touches) and self._complete(skin, measured.live) and now.information is not None
-        if not may or not skin.faults.plain(oldest_s) or (measured.whole and skin.drift.remembers(measured.middle_s)):
+        scan, oldest_s, known = measured.scan, measured.oldest_s, self._information
+        if known is None or len(skin.touches) or not self._complete(skin, measured.live):
             return None
-        assert now.information is not None
+        if not skin.faults.plain(oldest_s) or (measured.whole and skin.drift.remembers(measured.middle_s)):
+            return None
         y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
         alike, sure = skin.noise.alike(scan.part), skin.drift.even_variance(measured.middle_s)
-        return skin.quick.look(alike, scan, measured.middle_s, y, now.information, sure)
+        return skin.quick.look(alike, scan, measured.middle_s, y, known.each, sure)
 
     def _came_slowly(self, skin: TaredSkin, measured: LookedAt) -> tuple[Question, ScoredAnswer] | None:
         """A touch where nothing touched, that no drift since a while ago explains: the filter is that of then."""
@@ -270,7 +276,7 @@ class Estimator:
         leave_out(covariance, live)
         y = np.where(live, measured.log_z - skin.log_z0 - predicted.shift, 0.0)
         information = skin.hypotheses.grid.information(Whitening.of(covariance))
-        question = measured.question(y, covariance, live, measured.times_s, information, ())
+        question = measured.question(y, covariance, live, information, ())
         answer = skin.hypotheses.slowly(question)
         if answer is None:
             return None
@@ -305,16 +311,16 @@ class Estimator:
 
     def _going_on(self, skin: TaredSkin, measured: LookedAt) -> tuple[Question, ScoredAnswer] | None:
         """That touches which stayed as they are do so in a further part of a scan; else None."""
-        now, middle_s, span_s = self.now, measured.middle_s, measured.span_s
-        if measured.whole or now.information is None or not skin.touches.steady or now.unexplained_s:
+        middle_s, span_s, information = measured.middle_s, measured.span_s, self._information
+        if measured.whole or information is None or not skin.touches.steady or self.now.unexplained_s:
             return None
         if not skin.faults.plain(measured.oldest_s) or not self._complete(skin, measured.live):
             return None
-        known = skin.held.known(skin.noise.alike(measured.scan.part), middle_s, skin.touches.ids)
+        known = skin.quick.held(skin.noise.alike(measured.scan.part), middle_s, skin.touches.ids)
         if known is None:
             return None
         y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
-        question = measured.question(y, known.covariance, measured.live, measured.times_s, now.information, ())
+        question = measured.question(y, known.covariance, measured.live, information.each, ())
         answer = skin.hypotheses.goes_on(question, skin.touches.expected(middle_s, span_s), known.white, known.turned)
         return (question, answer) if answer.explained and answer.left_z2 < n.GLANCE_Z2 else None
 
@@ -365,7 +371,8 @@ class Estimator:
         oldest_s = measured.oldest_s
         plain = explained and not asked.changed and skin.faults.plain(oldest_s)
         if plain and self._complete(skin, measured.live):
-            self._keep_looks(skin, measured, question, answer)
+            even_variance, alike = skin.drift.even_variance(measured.middle_s), skin.noise.alike(scan.part)
+            skin.quick.keep(alike, measured.middle_s, skin.touches.ids, question, answer, even_variance)
         skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
         gross = skin.faults.gain_gross(measured.end_s)
         sound, undecided = skin.faults.sound, skin.faults.now.doubt.undecided
@@ -386,13 +393,6 @@ class Estimator:
             question = replace(question, y=question.y - drifted)
         return self._said(skin, measured, question, answer, judgements, explained and not went, rough)
 
-    def _keep_looks(self, skin: TaredSkin, measured: LookedAt, question: Question, answer: ScoredAnswer) -> None:
-        """What the next looks need, of a scan with which nothing is wrong."""
-        alike, middle_s = skin.noise.alike(measured.scan.part), measured.middle_s
-        skin.held.keep(alike, middle_s, skin.touches.ids, question, answer)
-        if answer.fit is None:
-            skin.quick.keep(alike, middle_s, question.white, skin.drift.even_variance(middle_s))
-
     def _likeliest_age(self, skin: TaredSkin, measured: LookedAt) -> tuple[Asked, AskedScan]:
         """What explains a scan: the first one after a baseline was adopted tells how far the skin has drifted. In doubt
         further: who takes drift for a touch is worse off than who is unsure.
@@ -401,7 +401,7 @@ class Estimator:
             return self._explaining(skin, measured)
         found, faults, budget = [], skin.faults.now, measured.budget.left
         for state in skin.aged:
-            skin.drift.now, skin.faults.now, self.now.information = state, deepcopy(faults), None
+            skin.drift.now, skin.faults.now, self._information = state, deepcopy(faults), None
             measured.budget.left = budget
             found.append((*self._explaining(skin, measured), state, skin.faults.now))
         holding = [each for each in found if each[0].answer.holds] or found
@@ -414,18 +414,8 @@ class Estimator:
     def _explaining(self, skin: TaredSkin, measured: LookedAt) -> tuple[Asked, AskedScan]:
         """What explains a scan, and the scan as it was asked about."""
         predicted = skin.drift.ahead(measured.middle_s, skin.noise.now.flicker)
-        scan, untouched = measured.scan, skin.log_z0 + predicted.shift
-        at = AskedScan(
-            values=scan.values,
-            status=scan.status,
-            untouched=untouched,
-            predicted=predicted,
-            part=scan.part,
-            times_s=measured.times_s,
-            span_s=measured.span_s,
-            middle_s=measured.middle_s,
-            whole=measured.whole,
-        )
+        own = measured.scan, measured.log_z, measured.live, measured.whole, measured.budget
+        at = AskedScan(*own, predicted, skin.log_z0 + predicted.shift)
         answering = Answering(self._tables, skin, measured, self.now.unexplained_s)
         asked = skin.asking(
             at,
@@ -438,13 +428,13 @@ class Estimator:
     def _question(
         self, hypotheses: Hypotheses, skin: TaredSkin, view: BoardView, covariance: Array, measured: LookedAt
     ) -> Question:
-        now = self.now
-        new = not np.array_equal(now.informed_live, view.live) or now.informed_wire != skin.faults.now.wire
-        if now.information is None or new or now.wholes - now.informed >= n.LINE_SCANS:
-            now.information = hypotheses.grid.information(Whitening.of(covariance))
-            now.informed, now.informed_live, now.informed_wire = now.wholes, view.live, skin.faults.now.wire
+        now, known, wire = self.now, self._information, skin.faults.now.wire
+        same = known is not None and np.array_equal(known.live, view.live) and known.wire == wire
+        if known is None or not same or now.wholes - known.wholes >= n.LINE_SCANS:
+            each = hypotheses.grid.information(Whitening.of(covariance))
+            known = self._information = GridInformation(each, now.wholes, view.live, wire)
         candidates = tuple(candidate.begun(measured) for candidate in now.candidates)
-        question = measured.question(view.y, covariance, view.live, view.times_s, now.information, candidates)
+        question = measured.question(view.y, covariance, view.live, known.each, candidates)
         return question.leaving(n.FOR_FAULTS)
 
     # --- what follows ---

@@ -21,7 +21,6 @@ from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, Mem
 from services.estimation.first.start import EarlierBaseline
 from services.estimation.first.tare import AgreedScans
 from services.estimation.learning import Learning, LearningState
-from services.estimation.looks.held import HeldLook
 from services.estimation.looks.quick import QuickLook
 from services.estimation.looks.slow import SlowLook, SlowState
 from services.estimation.refused import RefusedChange, RefusedState
@@ -32,12 +31,12 @@ Array = NDArray[np.float64]
 
 
 class KnownBaseline(NamedTuple):
-    """Of this skin, taken earlier."""
+    """Of this skin."""
 
     log_z0: Annotated[Array, "K"]
-    live: Annotated[NDArray[np.bool_], "K"]
+    live: Annotated[NDArray[np.bool_], "K"]  # what of it counts
     scatter: Annotated[Array, "K"]  # of log |Z| from scan to scan
-    frames: int
+    frames: int  # that it is the mean of
     doubt: str = ""  # why the skin may have been touched, for a person
 
     def after_long(self, tables: SkinTables) -> EarlierBaseline:
@@ -54,10 +53,7 @@ class KnownBaseline(NamedTuple):
 class TaredState:
     """All that changes of what stands on one baseline, and the baseline."""
 
-    log_z0: Annotated[Array, "K"]
-    live: Annotated[NDArray[np.bool_], "K"]
-    scatter: Annotated[Array, "K"]
-    frames: int
+    baseline: KnownBaseline
     noise: NoiseState
     lines: LineState
     drift: FilterState
@@ -74,19 +70,17 @@ class TaredState:
 class TaredSkin:
     """What stands on one baseline."""
 
-    def __init__(self, tables: SkinTables, log_z0: Array, live: NDArray[np.bool_], scatter: Array, frames: int) -> None:
-        """log_z0, live (K,): the baseline, and what of it counts; scatter (K,): of log |Z| from scan to scan, of which
-        the baseline is the mean of `frames`.
-        """
-        self.log_z0, self.live, self.scatter, self.frames = log_z0, live, scatter, frames
-        self.tables = tables.relative_to(np.exp(log_z0))
+    def __init__(self, tables: SkinTables, baseline: KnownBaseline) -> None:
+        self.baseline = baseline
+        self.log_z0, self.live, self.scatter, self.frames, _ = baseline
+        self.tables = tables.relative_to(np.exp(self.log_z0))
         self.noise, self.drift = NoiseModel(self.tables), SkinFilter(self.tables)
         self.touches = TouchTracks(self.tables.response)
         self.hypotheses = Hypotheses(self.tables, self.noise, self.drift)
         self.learning = Learning(self.drift, self.noise)
         self.slow = SlowLook(self.drift)
         self.refused = RefusedChange(tables.measurements)
-        self.quick, self.held = QuickLook(self.hypotheses.grid), HeldLook()
+        self.quick = QuickLook(self.hypotheses.grid)
         self.aged = list[FilterState]()
         self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
         self.asking = FaultAsking(self.tables, self.noise, self.touches, self.hypotheses, self.faults)
@@ -118,7 +112,7 @@ class TaredSkin:
 
     def with_tables(self, tables: SkinTables) -> TaredSkin:
         """The same baseline and all that was learnt, with other tables of the same skin."""
-        made = TaredSkin(tables, self.log_z0, self.live, self.scatter, self.frames)
+        made = TaredSkin(tables, self.baseline)
         made.noise.now, made.noise.lines.now = self.noise.now, self.noise.lines.now
         made.touches.now, made.learning.now = self.touches.now, self.learning.now
         made.faults.now = self.faults.now
@@ -136,16 +130,12 @@ class TaredSkin:
     def forget_looks(self) -> None:
         """The untouched skin is another than at the last scans."""
         self.quick.forget()
-        self.held.forget()
 
     def state(self) -> TaredState:
         """What a whitening of a moment ago told is forgotten: who goes on from this state does not have it."""
         self.forget_looks()
         return TaredState(
-            log_z0=self.log_z0,
-            live=self.live,
-            scatter=self.scatter,
-            frames=self.frames,
+            baseline=self.baseline,
             noise=self.noise.now,
             lines=self.noise.lines.now,
             drift=self.drift.now,

@@ -490,11 +490,9 @@ def estimate_of(track: TrackedTouch, sample_s: float, span_s: float, unexplained
     to_said = np.zeros((4, STATES))
     to_said[0, X] = to_said[1, Y] = to_said[2, LOG_RADIUS] = 1.0
     to_said[3, ACTION], to_said[3, LOG_RADIUS] = by_action, -2 * drop / (1 + strength / 2)
-    area = float(np.pi * np.exp(2 * log_radius))
     said, place = to_said @ covariance @ to_said.T, state[PLACE]
     if track.stays_for >= n.STILL_SCANS and _stays(track):
         place = np.array(track.stays_at[:2])  # as sure as by one scan: what all of them get wrong is not known
-    to_integral = area * (to_said[3] + np.eye(STATES)[LOG_RADIUS] * 2 * drop)
     return TouchEstimate(
         id=track.id,
         began=track.began,
@@ -507,8 +505,6 @@ def estimate_of(track: TrackedTouch, sample_s: float, span_s: float, unexplained
         drop=drop,
         covariance=said,
         z2=track.z2,
-        integral=area * drop,
-        integral_sd=float(np.sqrt(max(to_integral @ covariance @ to_integral, 0.0))),
         strength=action,
         strength_sd=float(np.sqrt(max(covariance[ACTION, ACTION], 0.0))),
         unexplained=unexplained,
@@ -522,10 +518,4 @@ def roughly(touch: TouchEstimate, passed_s: float) -> TouchEstimate:
     covariance = touch.covariance.copy()
     covariance[0, 0] += n.ROUGH**2
     covariance[1, 1] += n.ROUGH**2
-    return replace(
-        touch,
-        age_s=touch.age_s + passed_s,
-        covariance=covariance,
-        strength_sd=touch.strength,
-        integral_sd=touch.integral,
-    )
+    return replace(touch, age_s=touch.age_s + passed_s, covariance=covariance, strength_sd=touch.strength)

@@ -1,10 +1,10 @@
-"""`skin bench trust`: what is counted, and that nothing of it is counted of what is right."""
+"""`skin bench trust`: what is counted, and that nothing of it is counted of what is right. `skin dev same`."""
 
 from dataclasses import replace
 
 import pytest
 
-from bench import ROOT
+from bench import ROOT, same
 from bench.trust import plans, runs
 from bench.trust.judge import Judge
 from bench.trust.runs import skin_of
@@ -190,3 +190,14 @@ def test_the_truth_says_nothing_of_what_a_world_hides() -> None:
     truth = TruePaths(what.script.tracks, session.sheet)
     assert truth.at(8.0)[0].force_n == pytest.approx(3.0) and truth.at(9.2) == []
     session.host.close()
+
+
+def test_the_same_is_the_same_and_another_number_is_seen(tmp_path, monkeypatch):
+    def lines():
+        same.keep(tmp_path / "kept", "adaptive")
+        return same.kept(tmp_path / "kept")["recording adaptive"]
+
+    found = lines()
+    assert len(found) > 500 and not same.difference(found, lines())
+    monkeypatch.setattr("services.preprocessing.PLACE_SIGMA", 1.1e-4)
+    assert "estimates\n  here   [{" in same.difference(found, lines())

@@ -29,6 +29,7 @@ USUAL = {  # what each command needs to run at all, where no service does; a fil
     "import": "rows.npz imported.mcap --skin square16 --overwrite",
     "info": "none.mcap",
     "golden": "none.mcap",
+    "dev same": "--against none",
     "export": "none.mcap --csv",
     "calibrate force": "--csv none.csv",
     "bridge": "pge",

@@ -189,14 +189,8 @@ def test_a_measured_map_is_read_between_its_places_and_told_in_model_units() -> 
     assert seen.error == pytest.approx(mixes @ made.error @ mixes.T)
 
 
-def test_touches_on_a_measured_map_are_placed_by_the_locator_and_its_error_adds_to_the_misfit() -> None:
+def test_the_error_of_a_measured_map_adds_to_the_misfit() -> None:
     made, _ = measured_map()
-    states = np.array([[0.16, 0.08, 0.0, 2.0, 0.0, 0.0, 0.0], [-0.08, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0]])
-    difference = 2.0 * made(0.16, 0.08, 0.0) + 3.0 * made(-0.08, 0.0, 0.0)
-    first, second = made.located(difference, np.full(10, 1e-5), states)
-    assert (first.x, first.y) == pytest.approx((0.008, 0.004), abs=1e-3)
-    assert (second.x, second.y) == pytest.approx((-0.004, 0.0), abs=1e-3)
-    assert made.located(difference, np.full(10, np.inf), states) == []
     few = replace(tables(), misfit=np.eye(10) / 10, map=made)
     assert few.misfit_of(0.1) == pytest.approx(few.wrong**2 * 0.1 * np.eye(10) / 10 + made.error)
     assert replace(few, predicted=False).tells

@@ -179,7 +179,6 @@ def test_a_touchs_misfit_and_values_that_do_not_count_make_it_less_sure() -> Non
     sure, unsure = TouchFitter(scan, [prior], 0.0).fit(10), TouchFitter(scan, [prior], 0.5).fit(10)
     added = np.linalg.inv(unsure.white.w.T @ unsure.white.w) - 1e-8 * np.eye(120)
     assert_allclose(np.diag(added), 0.5**2 * unsure.known.size2 / 120, rtol=1e-3)
-    assert 0.4 < unsure.size**2 / unsure.known.size2 < 2.5 and unsure.size == pytest.approx(sure.size, rel=0.2)
     assert (np.diag(unsure.covariance)[PLACE] > 2 * np.diag(sure.covariance)[PLACE]).all()
     white = TouchFitter(scan, [replace(prior, until_s=0.01)], 0.0).fit(10).white.w  # it may end a little later
     added = np.diag(np.linalg.inv(white.T @ white)) - 1e-8

@@ -243,7 +243,7 @@ def test_a_changed_contact_is_told_by_one_scan(electrode: int, times: float) -> 
 def test_nothing_is_no_change_and_neither_is_a_touch() -> None:
     log_z = scan(transfer())
     nothing = asked(log_z)
-    well = nothing.white.log_density - 0.5 * float(nothing.white(nothing.y) @ nothing.white(nothing.y))
+    well = nothing.white.log_likelihood(nothing.y)
     change, _ = likeliest(log_z)
     assert abs(change.size) < 4 * change.variance**0.5 and change.score < well
     assert gain_change(nothing, -np.inf).score < well

@@ -208,26 +208,31 @@ def part(number):
     return frame
 
 
+def times_s(scan):
+    """(K,) when each value was measured, from `sample` on."""
+    return (scan.at_ns - scan.sample_ns) * 1e-9 - scan.ages_s
+
+
 def test_a_whole_scan_is_new_and_of_parts_what_the_newest_ones_brought():
     second = Scan.of(whole(2), Scan.of(whole(1)))
-    assert second.complete and second.part == 0 and (np.diff(second.ages_s) < 0).all()
+    assert second.new.all() and second.part == 0 and (np.diff(second.ages_s) < 0).all()
     assert second.duration_s == pytest.approx(PERIOD_US * 1e-6, rel=1e-3)
-    assert second.times_s.mean() == pytest.approx(0.0, abs=1e-5)  # `sample` is its middle
+    assert times_s(second).mean() == pytest.approx(0.0, abs=1e-5)  # `sample` is its middle
     before = Scan.of(part(20))
     scan = Scan.of(part(21), before)
-    assert scan.new.sum() == 12 and not scan.complete
+    assert scan.new.sum() == 12
     assert scan.ages_s[scan.new].max() < scan.ages_s[~scan.new].min()
-    assert scan.times_s[scan.new].mean() == pytest.approx(0.0, abs=1e-5)  # `sample` is the newest part's middle
+    assert times_s(scan)[scan.new].mean() == pytest.approx(0.0, abs=1e-5)  # `sample` is the newest part's middle
     assert Scan.of(part(23), before).new.sum() == 36, "what a skipped message brought is new too"
-    assert Scan.of(part(30), before).complete
-    assert Scan.of(part(3), Scan.of(part(2000))).complete  # the board's clock began anew
+    assert Scan.of(part(30), before).new.all()
+    assert Scan.of(part(3), Scan.of(part(2000))).new.all()  # the board's clock began anew
 
 
 def test_the_ellipse_of_a_place_points_as_its_covariance_says_and_one_not_explained_is_rough_in_x_and_y():
     turn = np.array([[np.cos(0.6), -np.sin(0.6)], [np.sin(0.6), np.cos(0.6)]])
     covariance = np.diag([0.0, 0.0, 0.04, 0.01])
     covariance[:2, :2] = turn @ np.diag([0.1**2, 0.02**2]) @ turn.T
-    touch = TouchEstimate(1, True, 1.0, 0.1, -0.2, 0.0, 0.0, -2.3, 0.3, covariance, 9.0, 0.1, 0.01, 0.1, 0.01, 0.0)
+    touch = TouchEstimate(1, True, 1.0, 0.1, -0.2, 0.0, 0.0, -2.3, 0.3, covariance, 9.0, 0.1, 0.01, 0.0)
     *axes, angle = on_the_wire(touch, 0.05).sigma
     assert [*axes, angle % np.pi] == pytest.approx([0.005, 0.001, 0.6], rel=0.05)
     more = roughly(touch, 0.045).covariance - covariance

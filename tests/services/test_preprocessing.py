@@ -93,7 +93,7 @@ def test_nothing_is_learnt_from_frames_that_acquisition_does_not_believe(tared: 
         out = tared.run(not_believed(board.frame(1e-4 * min(1.0, k / 50)), reason))
         assert not out.valid and reason in out.reasons
     after = tared.stage.estimator.state()["tared"]
-    assert all(str(learnt[part]) == str(after[part]) for part in ("drift", "noise", "log_z0", "touches"))
+    assert all(str(learnt[part]) == str(after[part]) for part in ("drift", "noise", "baseline", "touches"))
     even = [out.difference.mean() for out in tared.feel(1e-4, 200)]
     assert abs(np.mean(even[-20:])) < 0.2e-4 and np.mean(even[:2]) > 0.5e-4
 

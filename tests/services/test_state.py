@@ -137,9 +137,9 @@ def test_an_impossible_baseline_is_refused(tared, key, value):
 
 
 @pytest.mark.parametrize(("keys", "value"), [
-    ("estimator tared log_z0", np.ones(7)),
-    ("estimator tared log_z0", lambda z: z * np.nan),
-    ("estimator tared scatter", np.ones((3, 7))),
+    ("estimator tared drift remainder", np.ones(7)),
+    ("estimator tared drift remainder", lambda z: z * np.nan),
+    ("estimator tared drift remainder_variance", np.ones((3, 7))),
     ("estimator tared drift x", lambda x: np.nan * x),
     ("estimator tared drift p", lambda p: -p),
     ("estimator tared touches next_id", "7"),

@@ -33,6 +33,11 @@ class Whitening:
         """S^-1 times (K, ...)."""
         return np.asarray(self.w.T @ (self.w @ values))
 
+    def log_likelihood(self, values: Array) -> float:
+        """Of (K,) values over the mean, up to a constant."""
+        whitened = self(values)
+        return self.log_density - 0.5 * float(whitened @ whitened)
+
     def conditional_precisions(self) -> Array:
         """(K,) of each measurement given all others: the diagonal of S^-1."""
         return np.asarray((self.w**2).sum(axis=0))

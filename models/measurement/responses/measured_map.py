@@ -2,8 +2,7 @@
 
 An action of 1 is the registration's mean press. The map has no radius: how large a touch is, it does not tell. Its
 error is one dense covariance of a fixed size, from presses that were left out of it: as a diagonal, or in proportion to
-the touch, places are worse. Where measured presses were many, the locator's kernel machines say how far the
-likelihood's place is off, and how deep or how hard a press is; its ellipses are calibrated on presses left out.
+the touch, places are worse.
 """
 
 from __future__ import annotations
@@ -14,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from models.locator import Located, Locator
 from models.locator_arrays import LocatorArrays
 from models.measurement.numbers import TYPICAL_RADIUS
-from models.measurement.touch import ACTION, SHAPES, X, Y
+from models.measurement.touch import SHAPES
 
 Array = NDArray[np.float64]
 
@@ -27,8 +25,6 @@ class MeasuredMap:
 
     def __init__(self, arrays: LocatorArrays, metres_per_unit: float, mean_press: float = 1.0) -> None:
         """mean_press: action of the registration's mean press."""
-        self._metres, self.mean_press = metres_per_unit, mean_press
-        self._locator = Locator(arrays)
         rows, columns = (int(side) for side in arrays.shape)
         allowed = arrays.allowed.reshape(rows, columns)
         table = np.zeros((rows, columns, arrays.map.shape[1]))
@@ -39,7 +35,6 @@ class MeasuredMap:
         self._spacing = float(arrays.spacing) / metres_per_unit
         slopes = [np.gradient(table, self._spacing, axis=axis) for axis in (1, 0)]
         self._table: Array = np.stack([table, *slopes])  # (3, rows, columns, K)
-        self.measured: NDArray[np.bool_] = np.asarray(arrays.measured, bool)
         self.error = _of_touches(np.asarray(arrays.error, float), np.asarray(arrays.noise, float))
         iy, ix = np.nonzero(allowed)
         places = self._corner + self._spacing * np.column_stack([ix, iy])
@@ -76,22 +71,6 @@ class MeasuredMap:
     def directions(self, x: float, y: float, log_radius: float) -> Array:
         """(9, K) of nothing: what touches differ by is in `error`."""
         return np.zeros((SHAPES, self._table.shape[3]))
-
-    def located(self, difference: Array, sigma: Array, states: Array) -> list[Located]:
-        """Place with its calibrated ellipse, amplitude, depth or force of each touch, the others' response taken off.
-
-        difference (K,): of |Z|, relative; sigma (K,): its standard deviation, infinite where not measured; states
-        (T, 7): as fitted. Fewer touches come out where one explains nothing by itself, none where too little is left.
-        """
-        now = self._locator.condition(sigma)
-        if now is None:
-            return []
-        each = [state[ACTION] * self(state[X], state[Y], 0.0) for state in states]
-        whole = np.sum(each, axis=0)
-        found = [
-            self._locator.single(now, now.whiten @ (difference - whole + own)[now.live], len(each)) for own in each
-        ]
-        return [touch for touch in found if touch is not None]
 
 
 def _of_touches(error: Array, noise: Array) -> Array:

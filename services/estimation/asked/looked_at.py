@@ -62,7 +62,6 @@ class LookedAt:
         y: Array,
         covariance: Array,
         live: NDArray[np.bool_],
-        times_s: Array,
         information: NDArray[np.float32],
         candidates: tuple[TouchPrior, ...],
     ) -> Question:
@@ -71,7 +70,7 @@ class LookedAt:
             y=y,
             covariance=covariance,
             live=live,
-            times_s=times_s,
+            times_s=self.times_s,
             span_s=self.span_s,
             said_s=self.said_s,
             order=self.order,

@@ -135,6 +135,10 @@ class ScoredAnswer:
         """Whether it explains its scan, with touches or without."""
         return self.quiet if self.fit is None else self.explained
 
+    def information(self, column: Array) -> float:
+        """Of what else may add to the scan by this column (K,): 1 / variance of its size."""
+        return float(np.sum(self.white(column) ** 2)) if self.fit is None else self.fit.information(column)
+
 
 def started_from(fit: FoundTouches | None) -> list[TouchPrior]:
     """The priors of a fit, to be searched from where it ended."""

@@ -16,10 +16,9 @@ from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import ACTION, TouchPrior
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, begun_as
-from services.estimation.faults.board import BoardFaults, BoardView, as_they_stand
+from services.estimation.faults.board import AskedScan, BoardFaults, BoardView, as_they_stand
 from services.estimation.faults.doubt import ContactDoubt
 from services.estimation.faults.wires import WireFault
-from services.estimation.filter import Prediction
 from services.estimation.touches import TouchTracks
 from services.estimation.values import numbers as n
 
@@ -37,21 +36,6 @@ class Asked:
     question: Question
     answer: ScoredAnswer
     changed: bool = False  # a fault was found: the next scan is the first that it is taken off
-
-
-@dataclass(frozen=True)
-class AskedScan:
-    """One scan that is asked about."""
-
-    values: Array  # (K,) |Z|
-    status: NDArray[np.uint8]
-    untouched: Array  # (K,) log |Z| as the filter predicts it
-    predicted: Prediction
-    part: int
-    times_s: Array  # (K,) from the middle of the scan
-    span_s: float
-    middle_s: float
-    whole: bool  # it shares no value with the last whole one
 
 
 class FaultAsking:
@@ -84,23 +68,20 @@ class FaultAsking:
             touched, _ = self._change(standing, at)
             return faults.wires_changed(view, touched, skin + self._hypotheses.faster_drift(), own)
 
-        def look() -> BoardView:
-            return faults.look(at.values, at.status, at.untouched, at.times_s, at.span_s, at.middle_s)
-
         def asked(view: BoardView) -> Asked:
             hypotheses = self._seen(view)
             question = question_of(hypotheses, view, view.covariance(skin, own))
             return Asked(view, question, recounting(hypotheses, question, answering(hypotheses, question)))
 
-        view = look()
+        view = faults.look(at)
         if faults.now.wire is None and rewired(view):
-            view = look()
+            view = faults.look(at)
         found = asked(view)
         odd = _doubtful(found.answer) or -1 in found.answer.kept
         if faults.now.wire is not None and odd and rewired(view):
-            found = asked(look())
+            found = asked(faults.look(at))
         if faults.now.opens and faults.now.wire is None and (odd or (at.whole and self._touches.in_doubt)):
-            found = self._lifted(found, lambda: asked(look()))
+            found = self._lifted(found, lambda: asked(faults.look(at)))
         if faults.asks(found.answer):
             found = self._changed(found, at, *self._change(standing, at), answering)
         return self._doubted(found, at)
@@ -182,7 +163,7 @@ class FaultAsking:
         """(K, K) of what changes with the skin, and of what the measurements add."""
         contact = self._tables.contact
         flicker = (contact * self._noise.now.flicker) @ contact.T
-        return at.predicted.covariance + flicker, self._noise.covariance(at.part) - flicker
+        return at.predicted.covariance + flicker, self._noise.covariance(at.scan.part) - flicker
 
     def _with(self, standing: list[TouchPrior], loose: list[TouchPrior], question: Question) -> ScoredAnswer:
         if standing:

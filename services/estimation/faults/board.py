@@ -18,6 +18,7 @@ from models.measurement.covariance.whitening import Whitening, leave_out
 from models.measurement.fit import FoundTouches
 from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
+from services.estimation.asked.looked_at import LookedAt
 from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer
 from services.estimation.faults import advice, wires
 from services.estimation.faults.decided import DecidedState
@@ -31,6 +32,7 @@ from services.estimation.faults.impedance import (
 )
 from services.estimation.faults.table import BoardScan, WireTable
 from services.estimation.faults.wires import WireFault, WireKind, WireMaps
+from services.estimation.filter import Prediction
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -72,9 +74,18 @@ class FaultState:
 
 
 @dataclass(frozen=True)
+class AskedScan(LookedAt):
+    """One scan that is asked about."""
+
+    predicted: Prediction
+    untouched: Array  # (K,) log |Z| as the filter predicts it
+
+
+@dataclass(frozen=True)
 class BoardView:
     """One scan through the board."""
 
+    at: AskedScan
     log_z: Array  # (K,) 0 where it failed
     sound: Array  # (K,) what a board with sound wires would show, untouched
     failed: Mask
@@ -84,9 +95,6 @@ class BoardView:
     mean: Array  # (K,) relative change by contact impedances
     spread: Array  # (K, n) columns of unit variance of what is not known of it, the changed contact's own first
     contact: int  # electrode whose contact impedance is changed, as far as is known before; -1: none
-    times_s: Array  # (K,) from the middle of the scan
-    span_s: float
-    middle_s: float
     apart: bool = True  # `shown` is without contact impedances that changed
 
     @property
@@ -164,15 +172,12 @@ class BoardFaults:
 
     # --- what it makes of a scan ---
 
-    def look(
-        self, values: Array, status: NDArray[np.uint8], untouched: Array, times_s: Array, span_s: float, middle_s: float
-    ) -> BoardView:
-        """values (K,) |Z|, untouched (K,) log |Z| as the filter predicts it."""
-        now = self.now
-        at_s = middle_s + times_s
-        sound = untouched + np.where(at_s >= now.gain_since_s, now.log_gain, now.log_gain_before)
-        mean, spread = self._contacts(at_s, 2 * times_s / span_s)
-        readable = np.isfinite(values) & (values > 0) & (status == 0)
+    def look(self, at: AskedScan) -> BoardView:
+        now, values = self.now, at.scan.values
+        at_s = at.middle_s + at.times_s
+        sound = at.untouched + np.where(at_s >= now.gain_since_s, now.log_gain, now.log_gain_before)
+        mean, spread = self._contacts(at_s, 2 * at.times_s / at.span_s)
+        readable = np.isfinite(values) & (values > 0) & (at.scan.status == 0)
         log_z = np.log(np.where(readable, values, 1.0))
         shown, slopes, apart = sound, None, True
         if now.wire is None:
@@ -192,8 +197,7 @@ class BoardFaults:
             now.opens, now.lifted, now.silent = (), (), False  # what fails is left out: a wire that is wrong may be why
         dead = dead | (at_s < now.wire_since_s)  # measured by wires that were otherwise
         live = self._known & ~dead & ~self.member[:, list(now.opens)].any(axis=1)
-        times = times_s, span_s, middle_s
-        return BoardView(log_z, sound, failed, live, shown, slopes, mean, spread, now.contact, *times, apart)
+        return BoardView(at, log_z, sound, failed, live, shown, slopes, mean, spread, now.contact, apart)
 
     def _contacts(self, at_s: Array, course: Array) -> tuple[Array, Array]:
         now, columns = self.now, self.columns
@@ -231,7 +235,7 @@ class BoardFaults:
             return False
         if now.wire is None and best.score < self._by_gain(view, touched, skin + own) + n.WIRE_APART:
             return False
-        now.wire, now.wire_since_s = best.fault, view.middle_s + best.since_s
+        now.wire, now.wire_since_s = best.fault, view.at.middle_s + best.since_s
         now.unexplained_scans = 0
         return True
 
@@ -239,7 +243,7 @@ class BoardFaults:
         """Log evidence and prior of a step of the gain, before the scan or within it, whatever touches."""
         white = Whitening.of(covariance + self._any_touch)
         y = np.where(view.live, view.y - np.log1p(touched), 0.0)
-        scan = Unexplained(y, np.ones_like(y), view.live, view.times_s, view.span_s, white)
+        scan = Unexplained(y, np.ones_like(y), view.live, view.at.times_s, view.at.span_s, white)
         return max(gain_change(scan, since_s).score for since_s in (-np.inf, gain_onset(scan))) + float(n.COST_GAIN)
 
     def _untouched(self, view: BoardView) -> BoardScan:
@@ -250,7 +254,7 @@ class BoardFaults:
             failed = failed | (np.abs(view.log_z - sound) > np.log(n.FAR))
         opens, _ = wires.open_electrodes(failed & self._known, self.member)
         known = self._known & ~self.member[:, list(opens)].any(axis=1)
-        return BoardScan(view.log_z, sound, failed & known, known, view.times_s, view.span_s)
+        return BoardScan(view.log_z, sound, failed & known, known, view.at.times_s, view.at.span_s)
 
     # --- contact impedances and gain ---
 
@@ -265,8 +269,7 @@ class BoardFaults:
     def shared_z2(self, answer: ScoredAnswer) -> float:
         """How much all values have in common beyond what explains a scan, in squared sigmas."""
         even = np.ones(len(answer.pulled))
-        told = answer.fit.information(even) if answer.fit is not None else float(np.sum(answer.white(even) ** 2))
-        return float(answer.pulled.sum()) ** 2 / told
+        return float(answer.pulled.sum()) ** 2 / answer.information(even)
 
     def explained_by_fault(
         self,
@@ -326,7 +329,7 @@ class BoardFaults:
 
     def began_within(self, view: BoardView) -> bool:
         """Whether the contact's change began after the oldest value of a scan."""
-        return self.now.contact_since_s > view.middle_s - view.span_s / 2
+        return self.now.contact_since_s > view.at.oldest_s
 
     def _sure(self, answer: ScoredAnswer) -> float:
         """By how much a fault must be likelier than an answer: small new touches on electrodes are seldom touches."""
@@ -383,7 +386,7 @@ class BoardFaults:
             y = np.where(question.live, question.y - np.log1p(touched), 0.0)
             white = Whitening.of(question.covariance + more)
             scan = Unexplained(y, 1 / (1 + touched), question.live, question.times_s, question.span_s, white)
-            nothing = white.log_density - 0.5 * float(np.sum(white(y) ** 2))
+            nothing = white.log_likelihood(y)
             best = max(self._every(scan, columns), key=lambda change: change.score + _cost(change))
             if isinstance(best, ContactChange) and abs(best.size) > n.CONTACT_MOST:
                 continue
@@ -435,13 +438,13 @@ class BoardFaults:
     def _take(self, view: BoardView, change: ContactChange | GainChange, told: float) -> None:
         """told: of the change, in sigmas of its prior."""
         now = self.now
-        since_s = view.middle_s + change.since_s
+        since_s = view.at.middle_s + change.since_s
         if isinstance(change, GainChange):
             now.log_gain_before, now.gain_since_s = now.log_gain, since_s
             now.log_gain += n.GAIN_CHANGES * told
-            now.gain_said_s = view.middle_s + view.span_s / 2
+            now.gain_said_s = view.at.end_s
             now.gain_steps += 1
-            self._gross(max(since_s, view.middle_s - view.span_s / 2))
+            self._gross(max(since_s, view.at.oldest_s))
             return
         before = now.size if change.electrode == now.contact else 0.0
         if now.contact not in (-1, change.electrode) and not now.doubt.undecided:
@@ -488,16 +491,16 @@ class BoardFaults:
             return
         home = min(0.0, -float(now.settled[now.contact]), key=lambda size: abs(now.size - size))  # where it is well
         if whole:
-            now.doubt.follow(view.middle_s, now.size, sd, home)
+            now.doubt.follow(view.at.middle_s, now.size, sd, home)
         self._stays(passed_s)
         now.back_scans = (now.back_scans + whole) if abs(now.size - home) < unsure else 0
         now.variance += (n.CONTACT_WALK_CHANGED * (1 + now.size)) ** 2 * min(passed_s / SCAN_S, 1.0)
-        drifts = view.middle_s < now.doubt.drifts_until_s
+        drifts = view.at.middle_s < now.doubt.drifts_until_s
         settles_s = n.UNDECIDED_SETTLES_S if now.doubt.undecided else n.CONTACT_SETTLES_S
         back = now.back_scans >= n.BACK_SCANS
         if not drifts and (back or now.still_s > settles_s):
             # One scan's size is off by its noise, and nothing would take that back.
-            now.size = home if back or now.doubt.stays(home) else now.doubt.lately(view.middle_s)
+            now.size = home if back or now.doubt.stays(home) else now.doubt.lately(view.at.middle_s)
             self._settle()
 
     def gain_holds(self, end_s: float) -> None:
@@ -528,9 +531,8 @@ class BoardFaults:
             return
         column = view.spread[:, 0]
         sd = float(np.sqrt(now.variance))
-        told = answer.fit.information(column) if answer.fit is not None else float(np.sum(answer.white(column) ** 2))
         now.size = max(now.size + sd * float(column @ answer.pulled), LEAST)
-        now.variance *= max(1 - told, 1e-4)
+        now.variance *= max(1 - answer.information(column), 1e-4)
 
     def drop_contact(self) -> None:
         """No contact has changed."""
@@ -568,8 +570,7 @@ class BoardFaults:
 
 def _told(column: Array, answer: ScoredAnswer) -> bool:
     """Whether an answer knows that there is a change; column (K,): of unit variance of what it may be."""
-    known = answer.fit.information(column) if answer.fit is not None else float(np.sum(answer.white(column) ** 2))
-    return float(column @ answer.pulled) ** 2 > n.ACTS_Z2 * max(1 - known, 0.0)
+    return float(column @ answer.pulled) ** 2 > n.ACTS_Z2 * max(1 - answer.information(column), 0.0)
 
 
 def _cost(change: ContactChange | GainChange) -> float:

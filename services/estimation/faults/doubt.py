@@ -56,7 +56,7 @@ class ContactDoubt:
         leave_out(covariance, view.live)
         asked = replace(question, y=y, covariance=covariance, budget=StepBudget(n.MOST_STEPS), keeps=0.0)
         contact = self._contact(asked)
-        nothing = asked.white.log_density - 0.5 * float(np.sum(asked.white(y) ** 2))
+        nothing = asked.white.log_likelihood(y)
         if contact.size < 0 or contact.score - nothing < n.FALSE_ALARM_Z2 / 2:  # no touch would be seen in it
             if faults.size - doubt.decided < doubt.least:
                 doubt.end(faults.size)

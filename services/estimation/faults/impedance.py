@@ -47,7 +47,6 @@ class GainChange:
     """Of the board, in one scan: log of the factor."""
 
     log_factor: float
-    variance: float
     since_s: float
     score: float
     chi2: float
@@ -228,7 +227,7 @@ def gain_change(scan: Unexplained, begins_s: float) -> GainChange:
     found = float(acts @ seen) / precision
     chi2 = float(seen @ seen) - found * float(acts @ seen)
     score = scan.white.log_density - 0.5 * (chi2 + np.log(precision * n.GAIN_CHANGES**2))
-    return GainChange(found, 1 / precision, begins_s, float(score), chi2 / max(int(scan.live.sum()), 1))
+    return GainChange(found, begins_s, float(score), chi2 / max(int(scan.live.sum()), 1))
 
 
 def _onsets(scan: Unexplained, columns: Array) -> Array:

@@ -44,7 +44,6 @@ class WireGuess:
     fault: WireFault | None
     since_s: float
     score: float  # log evidence and prior
-    chi2: float  # squared whitened residual a measurement that counts
 
 
 def any_touches(grid: DiscGrid) -> Array:
@@ -89,11 +88,9 @@ class WireTable:
             slopes = np.where(after[:, None], self._slopes(which, z0), slopes_before)
             white = Whitening.of(own + slopes @ skin @ slopes.T)
             residual = np.where(after, left[which], left[before])
-            chi2 = float(np.sum(white(residual) ** 2))
             prior = float(np.where(after, told[which], told[before]).sum()) + _cost(before, which)
-            counted = max(int(np.count_nonzero(residual)), 1)
             fault = self._maps.faults[which - 1] if which else None
-            found.append(WireGuess(fault, onset_s, white.log_density - 0.5 * chi2 + prior, chi2 / counted))
+            found.append(WireGuess(fault, onset_s, white.log_likelihood(residual) + prior))
         return sorted(found, key=lambda guess: -guess.score)
 
     def _slopes(self, which: int, z0: Array) -> Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import asdict, dataclass
 from statistics import NormalDist
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,31 +97,21 @@ def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Bas
             f"the frames scatter by {100 * noise:.1f} % (at most {100 * numbers.TARE_NOISY:.0f} %): "
             "check grounding and cable"
         )
-    found, limit = disagreement(good)
-    if found > limit:
-        raise NoBaseline(
-            f"the frames disagree (statistic {found:.0f}, limit {limit:.0f}): something touched or moved meanwhile"
-        )
+    if not (found := agreement(np.log(good))).holds:
+        raise NoBaseline(str(found))
     z0, sigma = np.zeros(frames.shape[1]), np.full(frames.shape[1], np.inf)
     z0[live], sigma[live] = mean, noise_of_frames(good, mean)
     sigma = plausible_noise(z0, sigma)
     doubt = ""
     if noise < numbers.TARE_IDENTICAL:
         doubt = identical(len(frames))
-    doubt = noisy(z0, sigma, pre) or doubt
+    share = float(np.median(sigma[live] / mean))
+    if pre.m.normalisation == "model" and share > numbers.TARE_UNTRAINED:  # a measured bundle knows its own noise
+        doubt = untrained(share)
     misfit = implausibility(z0, pre)
     if misfit > IMPLAUSIBLE:
         doubt = f"the baseline is {100 * misfit:.1f} % off what the bundle predicts: free the skin and run `skin tare`"
     return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
-
-
-def noisy(z0: Array, sigma: Array, pre: PreReconstructor) -> str:
-    """ "" or why no touch that is measured with this noise is to be believed. A measured bundle knows its own noise."""
-    live = np.isfinite(sigma) & (z0 > 0)
-    share = float(np.median(sigma[live] / z0[live])) if live.any() else 0.0
-    if pre.m.normalisation != "model" or share <= numbers.TARE_UNTRAINED:
-        return ""
-    return untrained(share)
 
 
 def identical(count: int) -> str:
@@ -150,24 +140,41 @@ def plausible_noise(z0: Array, sigma: Array) -> Array:
     return np.where(np.isposinf(sigma) | ~(np.abs(z0) > 0), np.inf, finite)
 
 
-def disagreement(frames: Array) -> tuple[float, float]:
-    """Chi-square statistic of the quarters' means against the noise within them, and the limit it keeps to when all
-    is quiet.
-    """
-    parts = int(numbers.TARE_QUARTERS)
-    n = len(frames) // parts * parts
-    quarters = frames[-n:].reshape(parts, n // parts, -1)
-    mean = frames.mean(axis=0)
-    # Presses that come and go make the quarters scatter within as well; from frame to frame they seldom do.
-    noise = np.minimum(quarters.var(axis=1, ddof=1).mean(axis=0), 0.5 * (np.diff(frames, axis=0) ** 2).mean(axis=0))
-    within = noise / (n // parts) + (numbers.TARE_HARMLESS * mean) ** 2
-    statistic = float((((quarters.mean(axis=1) - quarters.mean(axis=(0, 1))) ** 2).sum(axis=0) / within).sum())
-    dof_within = n - parts
-    f_mean = dof_within / (dof_within - 2)  # the noise within is estimated too
-    dof = (parts - 1) * frames.shape[1]
+class Agreement(NamedTuple):
+    """Whether untouched scans are the same but for their noise."""
+
+    statistic: float
+    limit: float  # that quiet scans keep to
+
+    @property
+    def holds(self) -> bool:
+        return not self.statistic > self.limit
+
+    def __str__(self) -> str:
+        """Why they make no baseline, to a person."""
+        return (
+            f"the frames disagree (statistic {self.statistic:.0f}, limit {self.limit:.0f}): something touched or moved "
+            "meanwhile"
+        )
+
+
+def agreement(scans: Array) -> Agreement:
+    """Chi-square of the quarters' means of (n, K) log |Z| against the noise within them."""
+    quarters = int(numbers.TARE_QUARTERS)
+    size = len(scans) // quarters
+    parts = scans[-quarters * size :].reshape(quarters, size, -1)
+    # Presses that come and go make the quarters scatter within as well; from scan to scan they seldom do.
+    steps = 0.5 * (np.diff(scans, axis=0) ** 2).mean(axis=0)
+    noise = np.minimum(parts.var(axis=1, ddof=1).mean(axis=0), steps)
+    within = noise / size + numbers.TARE_HARMLESS**2
+    means = parts.mean(axis=1)
+    statistic = float((((means - means.mean(axis=0)) ** 2).sum(axis=0) / within).sum())
+    dof_within = quarters * (size - 1)
+    dof = (quarters - 1) * scans.shape[1]
     quantile = NormalDist().inv_cdf(1 - numbers.TARE_DISAGREES)
     chi_square = dof * (1 - 2 / (9 * dof) + quantile * (2 / (9 * dof)) ** 0.5) ** 3  # Wilson-Hilferty
-    return statistic, float(chi_square * f_mean * (1 + 2 / dof_within))
+    estimated = dof_within / (dof_within - 2) * (1 + 2 / dof_within)  # the noise within is estimated too
+    return Agreement(statistic, float(chi_square * estimated))
 
 
 def implausibility(z0: Array, pre: PreReconstructor) -> float:

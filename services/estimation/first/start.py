@@ -132,7 +132,7 @@ class StartLadder:
         """
         covariances = [base + times**2 * form for times in LADDER]
         whites = [Whitening.of(covariance) for covariance in covariances]
-        density = [self._density(white) for white in whites]
+        density = [white.log_likelihood(self._y) for white in whites]
         last = min(len(LADDER), int(np.argmax(density)) + 2)
         found = list[Rung]()
         most = -np.inf
@@ -141,10 +141,6 @@ class StartLadder:
             found.append(self._rung(float(LADDER[k]), covariances[k], whites[k], density[k], cost, nothing))
             most = max(most, found[-1].touched)
         return found
-
-    def _density(self, white: Whitening) -> float:
-        residual = white(self._y)
-        return white.log_density - 0.5 * float(residual @ residual)
 
     def _rung(
         self, times: float, covariance: Array, white: Whitening, density: float, cost: float, nothing: bool

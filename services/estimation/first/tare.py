@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from statistics import NormalDist
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from models.measurement.responses.tables import FIELD_DEGREES, SkinTables
 from protocol.errors import EitskinError
 from services.estimation.faults.wires import WireFault, WireKind
-from services.estimation.first.baseline import LEAST_NOISE, identical, untrained
+from services.estimation.first.baseline import LEAST_NOISE, agreement, identical, untrained
 from services.estimation.first.start import EarlierBaseline, JudgedStart, StartJudge, StartSays
 from services.estimation.first.wiring import WiresAtStart
 from services.estimation.values import numbers as n
@@ -65,13 +64,6 @@ class AgreedScans(NamedTuple):
         together = float(np.median(own[self.live])) if self.live.any() else 0.0
         shrunk = (n_own * own + SHARED * together) / (n_own + SHARED)
         return np.asarray(np.sqrt(np.maximum(shrunk, max(self.least_white, LEAST_NOISE**2))))
-
-
-class Agreement(NamedTuple):
-    """Whether scans are the same but for their noise."""
-
-    statistic: float
-    limit: float  # that quiet scans keep to
 
 
 @dataclass
@@ -152,12 +144,9 @@ class LatestScans:
                 "cable"
             )
         slopes = np.array(FIELD_DEGREES) <= 1
-        found = agreement(good, tables.field[np.ix_(live, slopes)])
-        if found.statistic > found.limit:
-            raise TareRefused(
-                f"the frames disagree (statistic {found.statistic:.0f}, limit {found.limit:.0f}): something touched or "
-                "moved meanwhile"
-            )
+        found = agreement(without_drift(good, tables.field[np.ix_(live, slopes)]))
+        if not found.holds:
+            raise TareRefused(str(found))
         judgements = [judge("agrees", *found), judge("identical", n.TARE_IDENTICAL, max(noise, 1e-300))]
         if tables.predicted:  # a measured bundle knows its own noise
             judgements.append(judge("noise_trained", noise, n.TARE_UNTRAINED))
@@ -189,28 +178,6 @@ def without_drift(scans: Array, field: Array) -> Array:
     drift = np.linalg.lstsq(field, each, rcond=None)[0]
     drift *= min(1.0, n.TARE_DRIFTS / max(float(np.linalg.norm(drift)), 1e-12))
     return np.asarray(scans - slope[:, None] * (field @ drift))
-
-
-def agreement(scans: Array, field: Array) -> Agreement:
-    """Chi-square of the quarters' means of (n, K) log |Z| against the noise within them; field (K, n): the columns of
-    what may drift.
-    """
-    scans = without_drift(scans, field)
-    quarters = int(n.TARE_QUARTERS)
-    size = len(scans) // quarters
-    parts = scans[-quarters * size :].reshape(quarters, size, -1)
-    # Presses that come and go make the quarters scatter within as well; from scan to scan they seldom do.
-    steps = 0.5 * (np.diff(scans, axis=0) ** 2).mean(axis=0)
-    noise = np.minimum(parts.var(axis=1, ddof=1).mean(axis=0), steps)
-    within = noise / size + n.TARE_HARMLESS**2
-    means = parts.mean(axis=1)
-    statistic = float((((means - means.mean(axis=0)) ** 2).sum(axis=0) / within).sum())
-    dof_within = quarters * (size - 1)
-    dof = (quarters - 1) * scans.shape[1]
-    quantile = NormalDist().inv_cdf(1 - n.TARE_DISAGREES)
-    chi_square = dof * (1 - 2 / (9 * dof) + quantile * (2 / (9 * dof)) ** 0.5) ** 3  # Wilson-Hilferty
-    estimated = dof_within / (dof_within - 2) * (1 + 2 / dof_within)  # the noise within is estimated too
-    return Agreement(statistic, float(chi_square * estimated))
 
 
 @dataclass

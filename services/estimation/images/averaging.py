@@ -37,7 +37,6 @@ class FrameAverager:
 
     def reset(self) -> None:
         self._live: NDArray[np.bool_] | None = None  # measurements that count in it
-        self._step = 0  # of the allowance for drift under which it is reconstructed
         self._forget()
 
     def _forget(self) -> None:
@@ -47,11 +46,11 @@ class FrameAverager:
         self._count = 0  # frames since the last change
         self.scan = 0  # of the frame last reconstructed
 
-    def under(self, live: NDArray[np.bool_], step: int) -> None:
-        """What the next frame is reconstructed under. Frames under anything else make another image."""
-        if self._live is None or step != self._step or (live != self._live).any():
+    def of(self, live: NDArray[np.bool_]) -> None:
+        """Which measurements count in the next frame. Frames of others make another image."""
+        if self._live is None or (live != self._live).any():
             self._forget()
-        self._live, self._step = live, step
+        self._live = live
 
     def __call__(self, d: Array, scan: int, operator: Operator, limit: float) -> Array | None:
         """The difference (K,) to reconstruct now, or None to hold. limit: of the operator's score, which a scan's noise
@@ -79,7 +78,6 @@ class FrameAverager:
             "count": self._count,
             "scan": self.scan,
             "live": None if self._live is None else self._live.astype(np.uint8),
-            "step": self._step,
         }
 
     def load(self, state: dict[str, Any], measurements: int) -> None:
@@ -90,7 +88,7 @@ class FrameAverager:
         self.averaged, self._count, self.scan = int(state["averaged"]), int(state["count"]), int(state["scan"])
         self._recent.extend(shaped(row, (measurements,)) for row in state["recent"])
         if (live := state.get("live")) is not None:  # older recordings have none
-            self._live, self._step = shaped(live, (measurements,)) > 0, int(state["step"])
+            self._live = shaped(live, (measurements,)) > 0
         if self.scan < 0 or (self._reference is not None and self.averaged < 1):
             raise ValueError(f"a hold of {self.averaged} frames since scan {self.scan}: expected 1 or more, from 0 on")
 

@@ -54,7 +54,7 @@ class Reconstruction:
             return None
         if self._limit is None or self._limit[0] is not operator:
             self._limit = operator, operator.threshold(CHANGED, self.frames)
-        self._averager.under(np.isfinite(sigma), 0)
+        self._averager.of(np.isfinite(sigma))
         mean = self._averager(d, scan, *self._limit)
         return None if mean is None else Reconstructed(mean, self._averager.averaged)
 

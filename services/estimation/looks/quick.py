@@ -1,5 +1,5 @@
-"""A first look at a scan on which nothing touches: by the whitening of a moment ago, so that it costs a product with a
-vector. It only says that all is quiet; what is not goes the whole way.
+"""A first look at a scan by what one of a moment ago told: it costs a product with a vector where nothing touches, and
+one warm fit where touches stay as they are. It only says that all goes on; what does not goes the whole way.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from models.measurement.covariance.noise import BURST_BLOCK
 from models.measurement.covariance.whitening import Whitening
+from models.measurement.fit import KnownWhitening, Turned
 from models.measurement.responses.grid import DiscGrid
+from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer
 from services.estimation.values import numbers as n
 from services.estimation.values.scan import Scan
 
@@ -29,7 +31,7 @@ class Newest:
 
 @dataclass(frozen=True)
 class Glance:
-    """Of scans that are disturbed alike."""
+    """Of scans that are disturbed alike, while nothing touches."""
 
     at_s: float
     white: Whitening
@@ -52,30 +54,61 @@ class Glance:
 
 
 @dataclass(frozen=True)
+class HeldGlance:
+    """Of scans that are disturbed alike, under the same touches."""
+
+    at_s: float
+    ids: tuple[int, ...]
+    covariance: Array  # (K, K) without touches
+    white: KnownWhitening  # with them
+    turned: Turned
+
+
+@dataclass(frozen=True)
 class Seen:
     """What a look found."""
 
     quiet: bool
-    chi2: float
     z2: float
     pulled: Array  # (K,)
     y: Array  # (K,) what was looked at
 
 
 class QuickLook:
-    """Keeps a whitening for all parts that are disturbed alike; nothing that a replay would miss."""
+    """Keeps what is needed for all parts that are disturbed alike, by NoiseModel.alike; nothing that a replay would
+    miss.
+    """
 
     def __init__(self, grid: DiscGrid) -> None:
         self._grid = grid
         self._glances: dict[int, Glance] = {}
+        self._held: dict[int, HeldGlance] = {}
 
     def forget(self) -> None:
         """The untouched skin is another."""
         self._glances.clear()
+        self._held.clear()
 
-    def keep(self, alike: int, at_s: float, white: Whitening, even_variance: float) -> None:
-        """alike: as NoiseModel.alike."""
-        self._glances[alike] = Glance(at_s, white, even_variance)
+    def keep(
+        self,
+        alike: int,
+        at_s: float,
+        ids: tuple[int, ...],
+        question: Question,
+        answer: ScoredAnswer,
+        even_variance: float,
+    ) -> None:
+        """Of a scan with which nothing is wrong; ids: of what touches."""
+        self._held.pop(alike, None)
+        if (fit := answer.fit) is None:
+            self._glances[alike] = Glance(at_s, question.white, even_variance)
+        elif answer.cause == AS_IT_IS and answer.explained:
+            self._held[alike] = HeldGlance(at_s, ids, question.covariance, fit.known, fit.turned)
+
+    def held(self, alike: int, at_s: float, ids: tuple[int, ...]) -> HeldGlance | None:
+        """None: nothing is known of such scans under these touches."""
+        found = self._held.get(alike)
+        return found if found is not None and found.ids == ids and 0 <= at_s - found.at_s < n.GLANCE_S else None
 
     def look(
         self,
@@ -100,4 +133,4 @@ class QuickLook:
         fresh = float(own @ newest.energy @ own) - len(own)
         z2 = max(self._grid.likeliest(pulled, information)[0], fresh)
         even = float(pulled.sum()) ** 2 / known.told_of_even < n.GAIN_Z2
-        return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, chi2, z2, pulled, y)
+        return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, z2, pulled, y)

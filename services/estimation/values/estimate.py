@@ -31,8 +31,6 @@ class TouchEstimate:
     drop: float  # of conductivity, mean over the disc
     covariance: Annotated[Array, "said", "said"]  # (4, 4) of x, y, log radius, drop
     z2: float  # of the disc: how much it explains, in squared sigmas
-    integral: float  # drop over the touch
-    integral_sd: float
     strength: float  # integral of drop / (1 - drop / 2): what the measurements tell best
     strength_sd: float
     unexplained: float  # share of the change that the fit leaves

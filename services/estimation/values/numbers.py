@@ -1,11 +1,7 @@
-"""Every number of the estimator that decides something, with unit, meaning and origin; `table()` prints them all."""
+"""Every number of the estimator that decides something, with unit, meaning and origin."""
 
 from __future__ import annotations
 
-import sys
-
-from models.measurement import number
-from models.measurement import numbers as measurement
 from models.measurement.number import Number
 from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START
 
@@ -267,8 +263,3 @@ SILENT = Number(0.7, "-", "share of measurements that fail where it is not elect
 DEGRADED = Number(2.0, "-", "electrodes at fault that a frame says", "chosen: as the service before")
 TOO_MANY = Number(3.0, "-", "electrodes at fault with which no frame is valid", "chosen: as the service before")
 """What a board's faults leave."""
-
-
-def table() -> str:
-    """All numbers as text, those of models/measurement first."""
-    return number.table(measurement, sys.modules[__name__])

@@ -37,16 +37,6 @@ class Scan:
     believed: bool  # acquisition's word
     reasons: tuple[str, ...]  # as they came
 
-    @property
-    def complete(self) -> bool:
-        """Whether every value was measured since the scan before: the only difference between boards."""
-        return bool(self.new.all())
-
-    @property
-    def times_s(self) -> Array:
-        """(K,) when each value was measured, from `sample_ns` on (below 0: before)."""
-        return (self.at_ns - self.sample_ns) * 1e-9 - self.ages_s
-
     def alone(self) -> Scan:
         """The same of a scan that stands by itself: whoever measured it waited, and nobody knows in which order."""
         return replace(self, separate=True, ages_s=np.full(len(self.values), self.duration_s / 2))

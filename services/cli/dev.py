@@ -1,0 +1,64 @@
+"""`skin dev same`: does a change leave every frame as it was? For whoever works on a checkout."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.cli.common import ROOT, USAGE, fail
+
+
+def register(app: typer.Typer) -> None:
+    dev = typer.Typer(help="For whoever changes a checkout.", no_args_is_help=True)
+    dev.callback()(lambda: None)  # so that `same` stays a command of its own
+    dev.command()(same)
+    app.add_typer(dev, name="dev")
+
+
+def same(
+    against: Annotated[
+        Path | None, typer.Option("--against", metavar="DIR|FILE", help="Another checkout, or what --keep wrote.")
+    ] = None,
+    keep: Annotated[Path | None, typer.Option("--keep", metavar="FILE", help="Write what came out.")] = None,
+    only: Annotated[str, typer.Option("--only", metavar="TEXT", help="Scenes with this in their names.")] = "",
+) -> None:
+    """Play fixed scenes, and say of each a hash of every field of every frame, and where it first differs."""
+    from bench import same as scenes
+
+    if against is not None and not against.exists():
+        fail(f"--against: no {against}: expected another checkout, or a file of --keep", USAGE)
+    with tempfile.TemporaryDirectory() as folder:
+        ours = keep if keep is not None else Path(folder, "ours")
+        _play(ROOT, ours.resolve(), only)
+        theirs = against
+        if against is not None and against.is_dir():
+            theirs = Path(folder, "theirs")
+            _play(against.resolve(), theirs, only)
+        found = scenes.kept(ours)
+        others = found if theirs is None else scenes.kept(theirs, only)
+    differing = 0
+    for name in found | others:
+        lines = found.get(name, [])
+        differs = scenes.difference(lines, others.get(name, []))
+        print(f"{scenes.digest(lines)} {len(lines):6} {name}" + f": {differs}" * bool(differs))
+        differing += bool(differs)
+    print(scenes.digest([line for lines in found.values() for line in lines]), "in all")
+    if differing:
+        fail(f"{differing} of {len(found | others)} scenes differ")
+
+
+def _play(checkout: Path, out: Path, only: str) -> None:
+    """In a process of the checkout's own, pinned as its tests are."""
+    from tests.pinned import pin
+
+    pin()
+    python = checkout / ".venv" / "bin" / "python"
+    words = [str(python) if python.exists() else sys.executable, "-P", "-m", "bench.same", str(out), only]
+    if subprocess.run(words, cwd=checkout, env=os.environ | {"PYTHONPATH": str(checkout)}).returncode:
+        fail(f"{checkout}: the scenes could not be played: what went wrong is above")
