@@ -67,18 +67,17 @@ class Answering:
         scan = self._measured.scan
         if not (_strained(answer) or self._skin.touches.odd or scan.separate):
             return answer
-        budget = StepBudget.of(max(float(scan.new.mean()), float(n.RECOUNTS)), scan.separate)
-        own = replace(question, budget=budget, keeps=0.0)
+        own = replace(question, budget=StepBudget.of(1.0, scan.separate), keeps=0.0, by_evidence=True)
         recount = Recount(hypotheses)
         other = found = recount(own, answer)
-        while scan.separate and other is not None and not own.spent:
+        while other is not None and not own.spent:
             other = recount(own, other)
             found = other or found
         if found is None or found.fit is None:
             return answer
         kept = self._skin.touches.recognised(found.fit, found.kept)
         known = sum(place >= 0 for place in kept)
-        return replace(found, kept=kept, score=found.score - n.COST_TOUCH * known, recounted=True)
+        return replace(found, kept=kept, score=found.score - own.touch_log_prior * known, recounted=True)
 
     def _of_measured(self, hypotheses: Hypotheses, question: Question, predicted: Prediction) -> ScoredAnswer:
         """Of a skin whose touches no response tells, or one that real touches differ from by more than anybody knows.
@@ -111,4 +110,4 @@ class Answering:
 
 def _strained(answer: ScoredAnswer) -> bool:
     """Whether touches explain a scan only roughly, or with the help of something else."""
-    return answer.cause != AS_IT_IS or not answer.explained
+    return answer.cause != AS_IT_IS or not answer.explained or (answer.wide and -1 in answer.kept)

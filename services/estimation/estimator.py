@@ -366,8 +366,9 @@ class Estimator:
         if explained or rough:
             self.now.candidates = []
         elif answer.fit is not None:  # else no touch was looked for
-            found = zip(answer.fit.states, answer.fit.priors, strict=True)
-            self.now.candidates = [OpenTouch(state, measured.middle_s + prior.since_s) for state, prior in found]
+            ids = [skin.touches.ids[place] if place >= 0 else 0 for place in answer.kept]
+            found = zip(answer.fit.states, answer.fit.priors, ids, strict=True)
+            self.now.candidates = [OpenTouch(state, measured.middle_s + each.since_s, id) for state, each, id in found]
         oldest_s = measured.oldest_s
         plain = explained and not asked.changed and skin.faults.plain(oldest_s)
         if plain and self._complete(skin, measured.live):
@@ -434,7 +435,9 @@ class Estimator:
             each = hypotheses.grid.information(Whitening.of(covariance))
             known = self._information = GridInformation(each, now.wholes, view.live, wire)
         candidates = tuple(candidate.begun(measured) for candidate in now.candidates)
-        question = measured.question(view.y, covariance, view.live, known.each, candidates)
+        ids = skin.touches.ids
+        places = tuple(ids.index(each.id) if each.id in ids else -1 for each in now.candidates)
+        question = measured.question(view.y, covariance, view.live, known.each, candidates, places)
         return question.leaving(n.FOR_FAULTS)
 
     # --- what follows ---

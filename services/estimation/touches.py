@@ -73,6 +73,8 @@ class TrackedTouch:
     lost: bool = False  # scans were lost since: it may be anywhere
     peak: float = 0.0  # action that it surely had
     held: float = 0.0  # action before it began to go
+    load: float = 0.0  # action that foam has felt of late
+    load_s: float = 0.0  # by then
     held_at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y, log radius then
     stayed_since_s: float = 0.0  # at held_at
     asked_odd: float = 0.0  # how odd its outline was when it was asked last whether it is several
@@ -142,24 +144,24 @@ class TouchTracks:
 
     @property
     def odd(self) -> bool:
-        """Whether an outline has become odd enough to be that of several touches: each time it became odder, and now
-        and then. Asking makes it known.
+        """Whether a touch may be several: while it is new, each time its outline became odder, and now and then.
+        Asking makes it known.
         """
         found = False
         for track in self.lasting:
             odd = oddness(track.shape)
             again = odd > n.ODDER * track.asked_odd or track.doubt_due
-            if odd > n.ODD_OUTLINE and again:
+            if (odd > n.ODD_OUTLINE and again) or track.scans in n.COUNT_DOUBTS:
                 track.asked_odd, found = odd, True
         return found
 
     def correct(self, fit: FoundTouches, kept: Sequence[int]) -> None:
         """Tracks stood for several touches, or for parts of one: they were never where they were held."""
         for place, track in enumerate(self.now.tracks):
-            track.held = 0.0
+            track.held = track.load = 0.0
             if place in kept:
                 state = fit.states[kept.index(place)]
-                track.held = track.peak = float(state[ACTION])
+                track.held = track.load = track.peak = float(state[ACTION])
                 track.held_at = (float(state[X]), float(state[Y]), float(state[LOG_RADIUS]))
 
     def lose(self) -> None:
@@ -321,10 +323,10 @@ class TouchTracks:
         return track
 
     def _memory(self, track: TrackedTouch, at_s: float, share: float) -> list[Memory]:
-        if not track.sure or track.held <= 0:
+        if not track.sure or track.load <= 0:
             return []
         x, y, log_radius = track.held_at
-        return [Memory(self._response(x, y, log_radius), share * track.held, at_s, x, y, log_radius)]
+        return [Memory(self._response(x, y, log_radius), share * track.load, at_s, x, y, log_radius)]
 
     def _held(self, track: TrackedTouch, at_s: float, span_s: float, whole: bool) -> list[Memory]:
         """Take note of what presses, and where. Of a touch that slid away returns what the place remembers where it
@@ -335,13 +337,15 @@ class TouchTracks:
         stayed_s = max(0.0, now_s - track.stayed_since_s)
         x, y, log_radius = track.held_at
         if np.hypot(track.state[X] - x, track.state[Y] - y) < n.MEMORY_APART * np.exp(log_radius):
+            fades = 1 - float(np.exp((track.load_s - now_s) / n.MEMORY_FADES_S[0]))
+            track.load, track.load_s = max(acts, track.load + fades * (acts - track.load)), now_s
             if not goes:
                 track.held = acts
                 _stay(track, span_s / (stayed_s + span_s) if whole else 0.0)
             return []
         share = 1.0 if goes else 1 - float(np.exp(-stayed_s / n.MEMORY_FADES_S[0]))
         memories = self._memory(track, now_s, share)
-        track.stayed_since_s, track.held = now_s, acts
+        track.stayed_since_s, track.held, track.load, track.load_s = now_s, acts, acts, now_s
         _stay(track, 1.0)
         return memories
 

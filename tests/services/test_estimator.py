@@ -79,21 +79,37 @@ def test_a_light_touch_that_comes_slowly_beside_a_held_one_is_told_from_its_outl
     assert all(min(far_off(contact, touch) for touch in (strong, light)) < 4e-3 for contact in shown[-1].contacts)
 
 
+FAR = pressed("circle", 0.0047, 0.0223, 8.3e-3, 2.5), pressed("circle", -0.0072, -0.019, 23.1e-3, 0.86)
+WEAK_LAST = pressed("triangle", -0.0032, -0.0112, 5.6e-3, 1.44), pressed("circle", -0.0364, -0.0199, 12.5e-3, 2.98)
+
+
 @BOTH
-def test_three_touches_that_come_one_after_the_other_within_a_scan_are_three(parts):
-    """Two discs explain them roughly, the second where nothing is: they are counted again."""
-    three = (
-        pressed("circle", 0.0047, 0.0223, 8.3e-3, 2.5),
-        pressed("circle", -0.0072, -0.019, 23.1e-3, 0.86),
-        pressed("circle", -0.0279, 0.0176, 12e-3, 0.46),
-    )
+@pytest.mark.parametrize(
+    ("three", "begin"),  # s: when each begins, and for how long it grows
+    [
+        ((*FAR, pressed("circle", -0.0279, 0.0176, 12e-3, 0.46)), ((0.0, 0.025), (0.025, 0.013), (0.048, 0.015))),
+        ((*WEAK_LAST, pressed("rectangle", -0.0281, 0.0132, 17e-3, 0.34)), ((0.0, 0.032), (0.05, 0.044), (0.1, 0.066))),
+    ],
+    ids=["two discs explain them roughly", "two with odd outlines explain them"],
+)
+def test_three_touches_that_come_one_after_the_other_are_counted_again(parts, three, begin):
     steps = [impedance(*three[:count]) for count in range(4)]
     points = [(0.0, steps[0])]
-    for k, (begins_s, ramp_s) in enumerate(((0.0, 0.025), (0.025, 0.013), (0.048, 0.015))):
+    for k, (begins_s, ramp_s) in enumerate(begin):
         points += [(FREE_S + begins_s, steps[k]), (FREE_S + begins_s + ramp_s, steps[k + 1])]
-    shown = between_s(run(between(*points, (99, steps[3])), FREE_S + 0.8, parts), FREE_S + 0.4)
+    shown = between_s(run(between(*points, (99, steps[3])), FREE_S + 0.9, parts), FREE_S + 0.5)
     assert shows(shown, 3)
     assert all(min(far_off(contact, touch) for touch in three) < 5e-3 for contact in shown[-1].contacts)
+
+
+@BOTH
+def test_three_tips_that_begin_in_the_same_instant_are_never_one_between_two(parts):
+    places = (-0.0159, -0.0107, 5.1e-3, 1.27), (-0.0103, 0.0232, 5.7e-3, 1.72), (0.0232, -0.0049, 5.4e-3, 1.16)
+    tips = [pressed("circle", *place) for place in places]
+    shown = between_s(run(press(*tips, ramp_s=0.0), FREE_S + 0.3, parts), FREE_S)
+    plain = [frame for frame in shown if frame.valid and not {"changing", "coarse"} & set(frame.reasons)]
+    assert all(min(far_off(c, tip) for tip in tips) < 15e-3 for frame in plain for c in frame.contacts)
+    assert shows(between_s(shown, FREE_S + 0.15), 3)
 
 
 # touches that change

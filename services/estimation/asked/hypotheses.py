@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from models.measurement.course import SUDDEN_STEPS, TURN_STEPS, TouchCourse
 from models.measurement.covariance.noise import BURST_BLOCK, NoiseModel, in_blocks
 from models.measurement.covariance.whitening import Whitening
-from models.measurement.fit import LEAST_MEAN, FittedScan, FoundTouches, KnownWhitening, TouchFitter, Turned
+from models.measurement.fit import LEAST_MEAN, FittedScan, KnownWhitening, TouchFitter, Turned
 from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
 from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import (
@@ -232,7 +232,7 @@ class Hypotheses:
             if begun is not None and not _settled(question, found):
                 found.append(self.fitted(question, begun, (-1,) * count, n.STEPS_WARM))
         settled = question.spent or (count == 1 and _settled(question, found))
-        return found if settled else [*found, *self.search(question, (), None)]
+        return found if settled else [*found, *self.search(question)]
 
     def _of_standing(
         self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]
@@ -243,6 +243,10 @@ class Hypotheses:
             return answers
         if (nothing := self.untouched(question)) is not None:  # costs no step
             answers.append(nothing)
+            if _settled(question, answers):
+                return answers
+        if -1 in question.places:
+            answers += self._going_on(question, loose)
             if _settled(question, answers):
                 return answers
         if (begun := self._begun_otherwise(question, standing)) is not None:
@@ -261,11 +265,26 @@ class Hypotheses:
             return answers
         expected = self.fitted(question, standing, everyone, 0)
         causes = CAUSE_STEPS * len(self._wider) * len(loose)  # a search must not spend theirs
-        answers += self.search(replace(question, keeps=question.keeps + causes), everyone, expected.fit)
+        answers += self.search(replace(question, keeps=question.keeps + causes), expected)
         best = likeliest(answers)
         for cause in self._affordable(question):
             answers += self.with_cause(question, loose, everyone, cause, best.left)
         return answers
+
+    def _going_on(self, question: Question, loose: Sequence[TouchPrior]) -> list[ScoredAnswer]:
+        """What nearly explained the part before, a step further: those that stand, and the new ones beside them; or
+        foam remembers more of what went.
+        """
+        priors, kept = list(loose), list(range(len(loose)))
+        for candidate, place in zip(question.candidates, question.places, strict=True):
+            if place < 0:
+                priors.append(candidate)
+                kept.append(-1)
+            else:
+                priors[place] = replace(priors[place], start=candidate.start)
+        found = self.fitted(question, priors, tuple(kept), n.STEPS_COLD)
+        everyone = tuple(range(len(loose)))
+        return [found, *self.with_cause(question, loose, everyone, MEMORY, question.y, n.STEPS_WARM)]
 
     def _of_anything(
         self, question: Question, standing: Sequence[TouchPrior], before: Sequence[ScoredAnswer]
@@ -353,18 +372,23 @@ class Hypotheses:
         z2 = self.left_over.best(question, fit.pulled, fit.white, fit)[0]
         cost = n.COST_WIDE if wide and not self.wide else COSTS[cause]
         score = fit.evidence + cost + question.touch_log_prior * sum(place < 0 for place in kept)
-        near = question.separate and not apart(fit.states, kept)
+        near = question.by_evidence and not apart(fit.states, kept)
         return ScoredAnswer(
             cause, fit, kept, fit.chi2, z2, score, fit.white, fit.pulled, fit.left, near=near, wide=wide
         )
 
-    def search(self, question: Question, kept: tuple[int, ...], fit: FoundTouches | None) -> list[ScoredAnswer]:
-        """Further touches, one after the other: plain discs find them, their own outlines and evidence decide."""
+    def search(
+        self, question: Question, before: ScoredAnswer | None = None, outlined: Sequence[TouchPrior] | None = None
+    ) -> list[ScoredAnswer]:
+        """Further touches than those of an answer, one after the other: plain discs find them, their own outlines and
+        evidence decide. outlined: the touches of that answer, free to be no discs; None: as it has them.
+        """
         found = list[ScoredAnswer]()
-        pulled, white = question.white.solve(question.y), question.white
-        if fit is not None:
-            pulled, white = fit.pulled, fit.white
-        score, full = -np.inf, started_from(fit)
+        pulled, white, score = question.white.solve(question.y), question.white, -np.inf
+        fit, kept = None, tuple[int, ...]()
+        if before is not None:
+            pulled, white, score, fit, kept = before.pulled, before.white, before.score, before.fit, before.kept
+        full = started_from(fit) if outlined is None else list(outlined)
         while (len(fit) if fit else 0) < n.MOST_TOUCHES and not question.spent:
             z2, disc, action, since_s = self.left_over.best(question, pulled, white, fit, question.onsets)
             if z2 < question.least_z2:
@@ -383,28 +407,33 @@ class Hypotheses:
             assert fit is not None
             pulled, white = disc_alone.pulled, disc_alone.white
             found += self._outlined(question, full, kept, disc_alone)
-            if disc_alone.explained and not question.separate:
+            if disc_alone.explained and not question.by_evidence:
                 break
         return found
 
     def _outlined(
         self, question: Question, priors: Sequence[TouchPrior], kept: tuple[int, ...], discs: ScoredAnswer
     ) -> list[ScoredAnswer]:
-        """Touches that were found as discs with outlines of their own. In a row each may be a disc, or odder than
+        """Touches that were found as discs with outlines of their own. By evidence each may be a disc, or odder than
         outlines go.
         """
         outlined = self.fitted(question, started(priors, discs.fit), kept, n.STEPS_COLD)
         assert outlined.fit is not None
         found = [outlined]
-        if question.separate:
+        if question.by_evidence:
             found[0] = replace(outlined, score=max(outlined.score, discs.score))
-            if outlined.chi2 > n.GOOD:
-                found.append(self.fitted(question, started(priors, outlined.fit), kept, n.STEPS_COLD, wide=True))
+        found += self._wide(question, outlined)
         if (pair := neighbours(outlined.fit.states, kept)) is not None:
-            found.append(self.merged(question, outlined, *pair))
+            found += self.merged(question, outlined, *pair)
         return found
 
-    def merged(self, question: Question, answer: ScoredAnswer, a: int, b: int) -> ScoredAnswer:
+    def _wide(self, question: Question, answer: ScoredAnswer) -> list[ScoredAnswer]:
+        """The same touches by a response that is wrong by more, where that is asked and theirs leaves something."""
+        if not question.by_evidence or answer.chi2 <= n.GOOD:
+            return []
+        return [self.fitted(question, started_from(answer.fit), answer.kept, n.STEPS_COLD, wide=True)]
+
+    def merged(self, question: Question, answer: ScoredAnswer, a: int, b: int) -> list[ScoredAnswer]:
         """One outlined touch for two discs."""
         assert answer.fit is not None
         states = answer.fit.states
@@ -416,7 +445,8 @@ class Hypotheses:
         priors[a] = replace(one, since_s=min(priors[a].since_s, priors[b].since_s))
         del priors[b]
         kept = tuple(place for k, place in enumerate(answer.kept) if k != b)
-        return self.fitted(question, priors, kept, n.STEPS_COLD)
+        one_less = self.fitted(question, priors, kept, n.STEPS_COLD)
+        return [one_less, *self._wide(question, one_less)]
 
     def _begun_otherwise(self, question: Question, standing: Sequence[TouchPrior]) -> list[TouchPrior] | None:
         """A touch that began within these values did so at another instant than the first of them told; None where

@@ -64,6 +64,7 @@ class LookedAt:
         live: NDArray[np.bool_],
         information: NDArray[np.float32],
         candidates: tuple[TouchPrior, ...],
+        places: tuple[int, ...] = (),
     ) -> Question:
         """About this scan."""
         return Question(
@@ -78,7 +79,8 @@ class LookedAt:
             information=information,
             budget=self.budget,
             candidates=candidates,
-            separate=self.scan.separate,
+            places=places,
+            by_evidence=self.whole,
         )
 
 
@@ -88,6 +90,7 @@ class OpenTouch:
 
     state: Annotated[Array, "states"]
     since_s: float  # host's clock
+    id: int = 0  # of the one that it continues; 0: none
 
     def begun(self, measured: LookedAt) -> TouchPrior:
         """Anywhere in the next scan, searched from where it was at the end of that one: how it goes on nobody knows."""

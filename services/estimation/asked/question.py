@@ -58,7 +58,8 @@ class Question:
     information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
     budget: StepBudget
     candidates: tuple[TouchPrior, ...]  # touches that nearly explained the scan before, or this one
-    separate: bool = False  # no scan follows that tells more: how many touch is decided now
+    places: tuple[int, ...]  # of each the standing one that it continues; -1: it is new
+    by_evidence: bool = False  # how many touch is decided by evidence alone: of a whole scan; a part leaves more open
     keeps: float = 0.0  # steps that are left to who asks next
 
     @property
@@ -68,17 +69,17 @@ class Question:
     @property
     def touch_log_prior(self) -> float:
         """Of a touch that begins [nat]."""
-        return n.COST_TOUCH + (n.WIDE_START if self.separate else 0.0)
+        return n.COST_TOUCH + (n.WIDE_START if self.by_evidence else 0.0)
 
     @property
     def least_z2(self) -> float:
         """z^2 of a further disc that is tried."""
-        return float(n.ANOTHER_Z2 if self.separate else n.FALSE_ALARM_Z2)
+        return float(n.ANOTHER_Z2 if self.by_evidence else n.FALSE_ALARM_Z2)
 
     @property
     def least_gain(self) -> float:
         """Evidence that a further touch must add [nat]."""
-        return 0.0 if self.separate else float(n.ANOTHER)
+        return 0.0 if self.by_evidence else float(n.ANOTHER)
 
     @cached_property
     def instants(self) -> Array:

@@ -6,7 +6,8 @@ one touch looks like two.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from copy import copy
+from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,8 @@ class Recount:
     """Of one skin, seen as its hypotheses see it."""
 
     def __init__(self, hypotheses: Hypotheses) -> None:
-        self._hypotheses = hypotheses
+        self._hypotheses = copy(hypotheses)
+        self._hypotheses.wide = False  # what explains everything would hide how many there are
 
     def __call__(self, question: Question, answer: ScoredAnswer) -> ScoredAnswer | None:
         """Other touches than those of an answer, where they are likelier: None where they are not."""
@@ -50,31 +52,21 @@ class Recount:
         if answer.cause:
             same += ask.with_cause(question, begun, new, answer.cause, answer.left)
         discs = ask.fitted(question, [plain(prior) for prior in begun], new, n.STEPS_COLD)
-        found = [discs, *self._one_more(question, begun, discs)]
-        enough = max(each.score for each in same) + question.least_gain
+        found = [discs, *ask.search(question, discs, begun)]
+        enough = max(each.score for each in (*same, discs))
         assert same[0].fit is not None
         if (pair := neighbours(same[0].fit.states, new)) is not None:
-            found.append(ask.merged(question, same[0], *pair))
+            found += ask.merged(question, same[0], *pair)
         elif not any(other.explained and other.score > enough for other in found):
             oddest = np.argsort([-oddness(shape) for shape in answer.fit.shapes])
-            for one in oddest if question.separate else oddest[:1]:
+            for one in takewhile(lambda _: not question.spent, oddest):
                 found += self._halved(question, begun, discs, int(one))
         if not any(other.explained for other in found):
-            found += ask.search(question, (), None)
+            found += ask.search(question)
         others = [other for other in found if other.explained and _others(other.fit, answer.fit)]
         if not others or likeliest(others).score < enough:
             return None
         return likeliest(others)
-
-    def _one_more(self, question: Question, begun: Sequence[TouchPrior], discs: ScoredAnswer) -> list[ScoredAnswer]:
-        """A disc beside discs. begun: the touches of those discs, with their outlines."""
-        left = self._hypotheses.left_over
-        z2, disc, action, since_s = left.best(question, discs.pulled, discs.white, discs.fit, question.onsets)
-        if z2 < n.FALSE_ALARM_Z2 or len(begun) >= n.MOST_TOUCHES:
-            return []
-        x, y = self._hypotheses.grid.discs[disc, PLACE]
-        more = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
-        return self._beside(question, begun, started_from(discs.fit), [more])
 
     def _halved(
         self, question: Question, begun: Sequence[TouchPrior], discs: ScoredAnswer, one: int
@@ -86,10 +78,16 @@ class Recount:
         if fit is None or len(fit) >= n.MOST_TOUCHES:
             return []
         halves = self._halves(question, fit, one)
+        if not halves:
+            return []
+        as_discs, new = started_from(fit), (-1,) * (len(fit) + 1)
         rest = [k for k in range(len(fit)) if k != one]
-        kept = started_from(fit)
-        made = self._beside(question, [begun[k] for k in rest], [kept[k] for k in rest], halves) if halves else []
-        return [other for other in made if other.fit is not None and gaps(other.fit.states).min() > 0]
+        found = self._hypotheses.fitted(
+            question, [*(as_discs[k] for k in rest), *map(plain, halves)], new, 2 * n.STEPS_COLD
+        )
+        outlined = started([*(begun[k] for k in rest), *halves], found.fit)
+        both = found, self._hypotheses.fitted(question, outlined, new, n.STEPS_COLD)
+        return [other for other in both if other.fit is not None and gaps(other.fit.states).min() > 0]
 
     def _halves(self, question: Question, fit: FoundTouches, one: int) -> list[TouchPrior]:
         """The two discs that explain most of what one does, on either side of its middle; empty where none do."""
@@ -110,15 +108,6 @@ class Recount:
                     least = left
                     best = [anywhere(*at, acts, question.span_s) for at, acts in zip(places, actions, strict=True)]
         return best
-
-    def _beside(
-        self, question: Question, begun: Sequence[TouchPrior], discs: Sequence[TouchPrior], more: Sequence[TouchPrior]
-    ) -> list[ScoredAnswer]:
-        """More touches beside discs, all of them plain, and the same with outlines. begun: those discs with theirs."""
-        new = (-1,) * (len(discs) + len(more))
-        found = self._hypotheses.fitted(question, [*discs, *map(plain, more)], new, 2 * n.STEPS_COLD)
-        outlined = started([*begun, *more], found.fit)
-        return [found, self._hypotheses.fitted(question, outlined, new, n.STEPS_COLD)]
 
 
 def _others(fit: FoundTouches | None, than: FoundTouches) -> bool:

@@ -106,7 +106,7 @@ class FaultAsking:
         likely = () if fit is None else begun_as(fit, at.span_s)
 
         def ask(other: Question) -> ScoredAnswer:
-            return answering(hypotheses, replace(other, candidates=likely))
+            return answering(hypotheses, replace(other, candidates=likely, places=found.answer.kept))
 
         if found.view.slopes is not None:
             touched = np.maximum(found.view.slopes @ touched, LEAST_MEAN)
@@ -167,7 +167,7 @@ class FaultAsking:
 
     def _with(self, standing: list[TouchPrior], loose: list[TouchPrior], question: Question) -> ScoredAnswer:
         if standing:
-            return self._hypotheses.ask(question, standing, loose)
+            return self._hypotheses.ask(replace(question, candidates=(), places=()), standing, loose)
         quiet = self._hypotheses.untouched(question)
         assert quiet is not None
         return quiet

@@ -87,8 +87,8 @@ SURE_Z2 = Number(44.0, "-", "z^2 of a new touch that is shown", "derived: FALSE_
 """What touches do from scan to scan."""
 
 ONSET_Z2 = Number(7.0, "-", "z^2 that a touch which began within a scan must have beyond", "derived: 2 ln of 33 onsets")
-ANOTHER = Number(15.0, "nat", "evidence that a further touch adds", "derived: 650 discs in 1e4 frames, and 2")
-ANOTHER_Z2 = Number(16.0, "-", "z^2 of a further disc that a row is tried with", "chosen: 4 sigmas; evidence decides")
+ANOTHER = Number(15.0, "nat", "evidence that a further touch adds in a part", "derived: 650 discs in 1e4 frames, and 2")
+ANOTHER_Z2 = Number(16.0, "-", "z^2 of a further disc that is tried by evidence", "chosen: 4 sigmas; evidence decides")
 WIDE_START = Number(
     4.1, "nat", "log prior that a new touch's wide start lacks", "derived: places 1.9 (sheet), actions 2.2 (1 to 100)"
 )
@@ -106,9 +106,6 @@ NEIGHBOURS = Number(
 MOST_TOUCHES = Number(4.0, "-", "touches at once", "chosen: cost; image and contact frames hold more")
 MOST_STEPS = Number(200.0, "-", "steps times touches of one scan, beyond which nothing new is asked", "chosen: 30 ms")
 LEAST_BUDGET = Number(0.4, "-", "of them, for a part of a scan", "chosen: the parts after it are asked as well")
-RECOUNTS = Number(
-    0.55, "-", "of a scan's steps, for a whole one in parts asked again", "measured: 0.4 leaves three as two"
-)
 SEPARATE = Number(4.0, "-", "times that, of a scan that stands by itself", "chosen: four scans find any three touches")
 FOR_FAULTS = Number(0.4, "-", "of them, for what the board may have done", "derived: two changes, two fits each")
 STEPS_WARM = Number(4.0, "-", "steps of a fit from the scan before", "measured: 2 or 3 are used")
@@ -252,6 +249,7 @@ ACTS_Z2 = Number(9.0, "-", "squared sigmas of a touch's action, below which it m
 SMALL = Number(0.2, "unit", "radius of a touch that may be an electrode's contact", "derived: an electrode's width")
 COST_SMALL = Number(-8.0, "nat", "log prior of such a touch on an electrode", "derived: share of the sheet that it is")
 CONTACT_DOUBTS = (1, 2, 8, 24, 72)  # whole scans of a touch on an electrode, at which it is asked whether it is one
+COUNT_DOUBTS = (2, 8, 24)  # whole scans of a touch, at which it is asked whether it is several
 WEAK = Number(0.3, "-", "of its greatest action, below which a touch on an electrode is doubted", "chosen: it goes")
 TOLD_BY = Number(24.0, "-", "measurements since a change began, at least", "derived: two parts; one is as well a touch")
 STANDS_WAY = Number(0.02, "unit", "way of a touch that stands, in a scan", "derived: 1 mm")
