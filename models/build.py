@@ -50,8 +50,8 @@ from models.linearise import linearise
 from models.network import MMCNN, NetworkConfig, multiply_accumulates
 from models.prereconstruction import Array, Matrices, PreReconstructor
 from models.pruning import is_part
+from models.response_file import ResponseTables
 from models.response_tables import response_tables
-from models.touch_response import ResponseTables
 from protocol.errors import EitskinError
 
 VALID = 1000

@@ -24,9 +24,9 @@ from bench.trust.session import PlayedSession, SessionPlan
 from bench.trust.stages import Judged, OtherCheckout, Today
 from firmware_stub.worlds import table
 from models.bundle import Bundle
-from services.runtime.config import Skin
+from services.runtime.config import ScanMode, Skin
 
-SCANS = ("full", "rolling")
+SCANS: tuple[ScanMode, ...] = ("full", "rolling")
 OURS = ""  # the checkout that runs the benchmark, beside the paths of others
 CODE = ("protocol", "models", "services", "firmware_stub", "simulation", "bench/trust")
 SAY_EVERY_S = 20.0
