@@ -68,13 +68,15 @@ class Answering:
         if not (_strained(answer) or self._skin.touches.odd or scan.separate):
             return answer
         own = replace(question, budget=StepBudget.of(1.0, scan.separate), keeps=0.0, by_evidence=True)
-        recount = Recount(hypotheses)
+        recount = Recount(hypotheses, 0.0 if scan.separate else float(n.RECOUNT_GAIN))
         other = found = recount(own, answer)
         while other is not None and not own.spent:
             other = recount(own, other)
             found = other or found
         if found is None or found.fit is None:
             return answer
+        if found.count < answer.count and self._skin.touches.meeting(self._measured.middle_s):
+            return answer  # they stood apart a moment ago: that they are several is known
         kept = self._skin.touches.recognised(found.fit, found.kept)
         known = sum(place >= 0 for place in kept)
         return replace(found, kept=kept, score=found.score - own.touch_log_prior * known, recounted=True)

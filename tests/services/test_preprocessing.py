@@ -15,9 +15,9 @@ from models.shapes import Shape
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA, JudgementsFrame, RawFrame, pack, unpack
 from services.describe import EVERY_S, MOVED
 from services.estimation.faults import checks
-from services.estimation.first.baseline import Baseline, NoBaseline, disagreement, take
+from services.estimation.first.baseline import Baseline, NoBaseline, agreement, take
 from services.estimation.first.start import JudgedStart, StartJudge, StartSays
-from services.estimation.first.tare import agreement
+from services.estimation.first.tare import without_drift
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin, TareConfig
 from services.runtime.stage import Refused
@@ -386,12 +386,12 @@ def test_a_skin_that_warms_is_tared_and_one_that_is_pressed_slowly_is_not(bundle
     """Limits of agreement are so far away that noise stays below, and so near that a press is noticed."""
     field, rng = tables_of(bundle).field[:, :3], np.random.default_rng(5)
     quiet = [1e-3 * rng.standard_normal((SCANS, 120)) for _ in range(300)]
-    of_field = [(found := agreement(each, field)).statistic / found.limit for each in quiet]
-    of_all = [np.divide(*disagreement(1 + each)) for each in quiet]
+    of_field = [np.divide(*agreement(without_drift(each, field))) for each in quiet]
+    of_all = [np.divide(*agreement(np.log(1 + each))) for each in quiet]
     assert 0.6 < max(of_field) < 1 and 0.6 < max(of_all) < 1
     slope, noise = np.linspace(-0.5, 0.5, SCANS)[:, None], NOISE * rng.standard_normal((SCANS, 120))
-    warming = agreement(slope * 1e-3 * field[:, 0] + noise, field)
-    pressed = agreement(slope * Board(bundle).disc(0.3, 0.0, 0.2, 0.05) + noise, field)
+    warming = agreement(without_drift(slope * 1e-3 * field[:, 0] + noise, field))
+    pressed = agreement(without_drift(slope * Board(bundle).disc(0.3, 0.0, 0.2, 0.05) + noise, field))
     assert warming.statistic < warming.limit and pressed.statistic > pressed.limit
 
 

@@ -37,7 +37,9 @@ HALVED_APART = (0.6, 1.0, 1.4)  # how far each lies from its middle, in radii
 class Recount:
     """Of one skin, seen as its hypotheses see it."""
 
-    def __init__(self, hypotheses: Hypotheses) -> None:
+    def __init__(self, hypotheses: Hypotheses, least_gain: float) -> None:
+        """least_gain: by which others must be likelier [nat]."""
+        self._least_gain = least_gain
         self._hypotheses = copy(hypotheses)
         self._hypotheses.wide = False  # what explains everything would hide how many there are
 
@@ -53,7 +55,7 @@ class Recount:
             same += ask.with_cause(question, begun, new, answer.cause, answer.left)
         discs = ask.fitted(question, [plain(prior) for prior in begun], new, n.STEPS_COLD)
         found = [discs, *ask.search(question, discs, begun)]
-        enough = max(each.score for each in (*same, discs))
+        enough = max(each.score for each in (*same, discs)) + self._least_gain
         assert same[0].fit is not None
         if (pair := neighbours(same[0].fit.states, new)) is not None:
             found += ask.merged(question, same[0], *pair)
