@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,8 @@ import numpy as np
 from models.measurement.responses.tables import SkinTables
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.asked.looked_at import LookedAt
-from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, StepBudget
+from services.estimation.asked.question import AS_IT_IS, Priors, Question, ScoredAnswer, StepBudget
 from services.estimation.asked.recount import Recount
-from services.estimation.faults.gap import judged_by_itself
 from services.estimation.filter import Prediction
 from services.estimation.tared import TaredSkin
 from services.estimation.values import numbers as n
@@ -20,38 +20,48 @@ from services.estimation.values import numbers as n
 class Answering:
     """Of one scan."""
 
-    def __init__(self, tables: SkinTables, skin: TaredSkin, measured: LookedAt, unexplained_s: float) -> None:
+    def __init__(
+        self, tables: SkinTables, skin: TaredSkin, measured: LookedAt, predicted: Prediction, unexplained_s: float
+    ) -> None:
         """unexplained_s: for how long nothing has explained the scans before."""
-        self._tables, self._skin, self._measured, self._unexplained_s = tables, skin, measured, unexplained_s
+        self._tables, self._skin, self._measured = tables, skin, measured
+        self._predicted, self._unexplained_s = predicted, unexplained_s
         self._searched = False  # anew, whatever stands: once, it costs four scans' steps
 
-    def answer(self, hypotheses: Hypotheses, question: Question, predicted: Prediction) -> ScoredAnswer:
+    def answer(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
         """The likeliest one."""
         if not self._tables.predicted:
-            return self._of_measured(hypotheses, question, predicted)
+            return self._of_measured(hypotheses, question)
         if self._unexplained_s > n.LOST_S:
             return self._of_lost(hypotheses, question)
-        return self._of_touched(hypotheses, question, predicted)
+        return self._of_touched(hypotheses, question)
 
-    def _of_touched(self, hypotheses: Hypotheses, question: Question, predicted: Prediction) -> ScoredAnswer:
-        if len(self._skin.touches):
-            standing = self._skin.touches.expected(self._measured.middle_s, self._measured.span_s)
-            loose = self._skin.touches.expected(self._measured.middle_s, self._measured.span_s, loose=True)
-            if self._skin.touches.lost:
-                return judged_by_itself(hypotheses, question, standing, loose)
-            if self._measured.whole and self._unexplained_s > 0 and not self._searched:
-                self._searched = True  # they may be others than those that stand
-                anew = self._from_nothing(hypotheses, question)
-                if anew.explained:
-                    return anew
-            if self._measured.whole and hypotheses.wide:
-                narrow = hypotheses.narrow(question, standing)
-                if narrow.explained:
-                    return narrow
-            return hypotheses.ask(question, standing, loose)
+    def _of_touched(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+        if not len(self._skin.touches):
+            return self._of_untouched(hypotheses, question)
+        standing = self._skin.touches.expected(self._measured.middle_s, self._measured.span_s)
+        loose = self._skin.touches.expected(self._measured.middle_s, self._measured.span_s, loose=True)
+        if self._skin.touches.lost:
+            return _judged_by_itself(hypotheses, question, standing, loose)
+        for answer in self._first_of_whole(hypotheses, question, standing):
+            if answer.explained:
+                return answer
+        return hypotheses.ask(question, standing, loose)
+
+    def _first_of_whole(self, hypotheses: Hypotheses, question: Question, standing: Priors) -> Iterator[ScoredAnswer]:
+        """What is asked of a whole scan before all else."""
+        if not self._measured.whole:
+            return
+        if self._unexplained_s > 0 and not self._searched:
+            self._searched = True  # they may be others than those that stand
+            yield self._from_nothing(hypotheses, question)
+        if hypotheses.wide:
+            yield hypotheses.narrow(question, standing)
+
+    def _of_untouched(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+        """Where nothing touched: nothing does, or what presses again where foam remembers more than it may, or all."""
         quiet = hypotheses.untouched(question)
-        assert quiet is not None
-        memory = self._skin.drift.beyond_memory(predicted, quiet.pulled, quiet.white)
+        memory = self._skin.drift.beyond_memory(self._predicted, quiet.pulled, quiet.white)
         if memory is not None and self._measured.whole and self._skin.faults.now.wire is None:
             pressed = hypotheses.at(question, memory.x, memory.y)
             if pressed.explained:
@@ -81,7 +91,7 @@ class Answering:
         known = sum(place >= 0 for place in kept)
         return replace(found, kept=kept, score=found.score - own.touch_log_prior * known, recounted=True)
 
-    def _of_measured(self, hypotheses: Hypotheses, question: Question, predicted: Prediction) -> ScoredAnswer:
+    def _of_measured(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
         """Of a skin whose touches no response tells, or one that real touches differ from by more than anybody knows.
         While something touches that nothing explains, all else is asked seldom.
         """
@@ -90,11 +100,11 @@ class Answering:
         if not often:
             question.budget.left = 0.0
         elif map_known and len(self._skin.touches):
-            return self._of_touched(hypotheses, question, predicted)
+            return self._of_touched(hypotheses, question)
         found = hypotheses.untold(question, self._skin.refused.now.column, often and not map_known)
         if found.quiet or not (often and map_known):
             return found
-        return self._of_touched(hypotheses, question, predicted)
+        return self._of_touched(hypotheses, question)
 
     def _of_lost(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
         """While nothing has explained the skin for long: a search now and then, from nothing."""
@@ -108,6 +118,17 @@ class Answering:
     def _from_nothing(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
         """Whatever touches, with the steps of a scan that stands by itself."""
         return hypotheses.ask(replace(question, budget=StepBudget.of(1.0, separate=True), keeps=0.0), (), ())
+
+
+def _judged_by_itself(hypotheses: Hypotheses, question: Question, standing: Priors, loose: Priors) -> ScoredAnswer:
+    """After lost time, or a board's reset, nothing vouches for what touched before. The likeliest of: the touches that
+    there were, which count as new ones; others, or none.
+    """
+    anew = hypotheses.ask(question.leaving(0.5), (), ())
+    before = hypotheses.ask(question, standing, loose)
+    kept = sum(place >= 0 for place in before.kept)
+    vouched = replace(before, score=before.score + n.COST_TOUCH * kept)
+    return max((anew, vouched), key=lambda answer: (answer.holds, answer.score))
 
 
 def _strained(answer: ScoredAnswer) -> bool:

@@ -11,27 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.covariance.whitening import Whitening, leave_out
-from models.measurement.fit import FoundTouches
 from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import ACTION, SHAPES, STATES
 from services.estimation.answering import Answering
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.asked.looked_at import LookedAt, OpenTouch
-from services.estimation.asked.question import (
-    AS_IT_IS,
-    BURST,
-    DRIFT,
-    MEMORY,
-    NOISE,
-    Question,
-    ScoredAnswer,
-    StepBudget,
-)
+from services.estimation.asked.question import AS_IT_IS, BURST, DRIFT, MEMORY, NOISE, Question, ScoredAnswer, StepBudget
 from services.estimation.faults import advice
-from services.estimation.faults.asking import Asked
-from services.estimation.faults.board import AskedScan, BoardView
+from services.estimation.faults.board import Asked, AskedScan, BoardView
 from services.estimation.faults.wires import WireFault
-from services.estimation.filter import Prediction
 from services.estimation.first.tare import (
     AgreedScans,
     BaselineTells,
@@ -213,37 +201,18 @@ class Estimator:
     def step(self, scan: Scan) -> Estimate:
         """What touches, by this scan and those before it."""
         self.learn()
-        now = self.now
-        oldest_us = scan.end_us - 1e6 * scan.duration_s
-        whole = not scan.part or oldest_us >= now.whole_us - 1.0 or scan.end_us < now.whole_us
-        gap_s = 0.0 if now.before is None else (scan.at_ns - now.before.at_ns) * 1e-9
-        now.before = scan
-        if whole:
-            now.whole_us = scan.end_us
-        measurable = np.isfinite(scan.values) & (scan.values > 0) & (scan.status == 0)
-        live = measurable if self.skin is None else measurable & self.skin.live
-        budget = StepBudget.of(float(scan.new.mean()), scan.separate)
-        measured = LookedAt(scan, np.log(np.where(live, scan.values, 1.0)), live, whole, budget)
-        if whole:
-            self.taring.offer(scan, measurable, measured.middle_s)
+        before, self.now.before = self.now.before, scan
+        gap_s = 0.0 if before is None else (scan.at_ns - before.at_ns) * 1e-9
+        measured = self._prepared(scan)
         judgements = [judge("believed", float(not scan.believed), 1.0)]
         judgements += self.taring.judgements(self.skin is not None)
-        if self.skin is not None and now.adopted_age_s is not None:
-            for state in self.skin.aged:
-                state.at_s += measured.middle_s
-            self.skin.drift.now = self.skin.aged[-1]
-            now.adopted_age_s = None
         if self.skin is None:
             self._first()
             return self._unknown(measured, judgements)
-        self.skin.noise.lines.ordered(scan.part, measured.order)
-        if not 0 <= gap_s <= n.GAP_S:
-            self.skin.touches.lose()
-        if gap_s < 0:
-            self.skin.learning.doubt()  # else it was no touch that had begun, if nothing touches now
+        self._pass(self.skin, measured, gap_s)
         if (slowly := self._came_slowly(self.skin, measured)) is not None:
             return self._held(self.skin, measured, *slowly, judgements)
-        seen, noticed, now.noticed = self._glanced(self.skin, measured), now.noticed, False
+        seen, noticed, self.now.noticed = self._glanced(self.skin, measured), self.now.noticed, False
         if seen is not None and seen.quiet:
             return self._quiet(self.skin, measured, seen, judgements)
         if seen is not None and not (noticed or measured.whole):
@@ -252,6 +221,32 @@ class Estimator:
             return self._held(self.skin, measured, *goes_on, judgements)
         return self._asked(self.skin, measured, max(gap_s, 0.0), judgements)
 
+    def _prepared(self, scan: Scan) -> LookedAt:
+        """A scan as it is looked at; a whole one may be one of a baseline."""
+        now, oldest_us = self.now, scan.end_us - 1e6 * scan.duration_s
+        whole = not scan.part or oldest_us >= now.whole_us - 1.0 or scan.end_us < now.whole_us
+        measurable = np.isfinite(scan.values) & (scan.values > 0) & (scan.status == 0)
+        live = measurable if self.skin is None else measurable & self.skin.live
+        budget = StepBudget.of(float(scan.new.mean()), scan.separate)
+        measured = LookedAt(scan, np.log(np.where(live, scan.values, 1.0)), live, whole, budget)
+        if whole:
+            now.whole_us = scan.end_us
+            self.taring.offer(scan, measurable, measured.middle_s)
+        return measured
+
+    def _pass(self, skin: TaredSkin, measured: LookedAt, gap_s: float) -> None:
+        """The time since the scan before: that a baseline was kept, or that scans were lost."""
+        if self.now.adopted_age_s is not None:
+            for state in skin.aged:
+                state.at_s += measured.middle_s
+            skin.drift.now = skin.aged[-1]
+            self.now.adopted_age_s = None
+        skin.noise.lines.ordered(measured.scan.part, measured.order)
+        if not 0 <= gap_s <= n.GAP_S:
+            skin.touches.lose()
+        if gap_s < 0:
+            skin.learning.doubt()  # else it was no touch that had begun, if nothing touches now
+
     def _glanced(self, skin: TaredSkin, measured: LookedAt) -> Seen | None:
         """What a first look sees where nothing touched before; None where it cannot tell."""
         scan, oldest_s, known = measured.scan, measured.oldest_s, self._information
@@ -259,7 +254,7 @@ class Estimator:
             return None
         if not skin.faults.plain(oldest_s) or (measured.whole and skin.drift.remembers(measured.middle_s)):
             return None
-        y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
+        y = self._innovation(skin, measured)
         alike, sure = skin.noise.alike(scan.part), skin.drift.even_variance(measured.middle_s)
         return skin.quick.look(alike, scan, measured.middle_s, y, known.each, sure)
 
@@ -289,9 +284,10 @@ class Estimator:
         """Whether every measurement that the baseline has counts."""
         return bool((live == skin.live).all())
 
-    def _over(self, skin: TaredSkin, measured: LookedAt) -> Array:
-        """(K,) log |Z| over what the filter predicts of the untouched skin."""
-        return measured.log_z - skin.log_z0 - skin.drift.shift(measured.middle_s)
+    def _innovation(self, skin: TaredSkin, measured: LookedAt) -> Array:
+        """(K,) log |Z| over what the filter predicts of the untouched skin on this board; 0 where it does not count."""
+        over = measured.log_z - skin.log_z0 - skin.drift.shift(measured.middle_s)
+        return np.where(measured.live, skin.faults.taken_off(over), 0.0)
 
     def _quiet(self, skin: TaredSkin, measured: LookedAt, seen: Seen, judgements: list[Judgement]) -> Estimate:
         self._explained(skin, measured, AS_IT_IS)
@@ -319,82 +315,57 @@ class Estimator:
         known = skin.quick.held(skin.noise.alike(measured.scan.part), middle_s, skin.touches.ids)
         if known is None:
             return None
-        y = np.where(measured.live, skin.faults.taken_off(self._over(skin, measured)), 0.0)
+        y = self._innovation(skin, measured)
         question = measured.question(y, known.covariance, measured.live, information.each, ())
         answer = skin.hypotheses.goes_on(question, skin.touches.expected(middle_s, span_s), known.white, known.turned)
         return (question, answer) if answer.explained and answer.left_z2 < n.GLANCE_Z2 else None
 
     def _held(
-        self,
-        skin: TaredSkin,
-        measured: LookedAt,
-        question: Question,
-        answer: ScoredAnswer,
-        judgements: list[Judgement],
+        self, skin: TaredSkin, measured: LookedAt, question: Question, answer: ScoredAnswer, judgements: list[Judgement]
     ) -> Estimate:
         settle(skin, question, answer, measured, self.now.unexplained_s)
         self._explained(skin, measured, answer.cause)
-        return self._said(skin, measured, question, answer, judgements, explained=True, rough=False)
+        return self._said(skin, measured, question, answer, judgements, explained=True)
 
     def _asked(self, skin: TaredSkin, measured: LookedAt, passed_s: float, judgements: list[Judgement]) -> Estimate:
+        self._drop_tracks(skin, measured)
+        asked = self._explain(skin, measured)
+        question, answer, view = asked.question, asked.answer, asked.view
+        measured = replace(measured, log_z=view.at.untouched + view.y, live=view.live)  # as sound wires would show it
+        if answer.nearly_holds:
+            settle(skin, question, answer, measured, self.now.unexplained_s)
+        transient = answer.fit is not None and not len(skin.touches)  # it came and went within the scan
+        self._lock(skin, measured, asked, transient)
+        self._keep_candidates(skin, measured, answer)
+        self._keep_whitening(skin, measured, asked)
+        skin.faults.follow(view, answer, passed_s, measured.whole)
+        sound = skin.faults.sound
+        skin.asking.decide(asked)
+        if sound:
+            self._learn(skin, measured, asked)
+        if sound and answer.fit is not None:
+            question = replace(question, y=question.y - _drifted(asked))
+        judgements += self._judged(skin, measured, asked)
+        return self._said(skin, measured, question, answer, judgements, answer.holds and not transient)
+
+    def _drop_tracks(self, skin: TaredSkin, measured: LookedAt) -> None:
+        """Those that ended before this scan, and those that a part told badly: it is asked about them anew."""
         skin.touches.drop_the_past(measured.oldest_s)
         if vague := skin.touches.drop_the_vague(skin.faults.in_question):
             self.now.candidates = [OpenTouch(track.state, track.since_s) for track in vague]
-        scan, steps = measured.scan, skin.faults.now.gain_steps
-        asked, at = self._likeliest_age(skin, measured)
+
+    def _explain(self, skin: TaredSkin, measured: LookedAt) -> Asked:
+        """What explains a scan, with all that the skin may remember."""
+        steps = skin.faults.now.gain_steps
+        asked = self._likeliest_age(skin, measured)
         if asked.answer.holds and (pressed := skin.refused.explained(measured.oldest_s)):
             skin.remember(pressed)
-            asked, at = self._explaining(skin, measured)  # again: what is left may be memory
+            asked = self._explaining(skin, measured)  # again: what is left may be memory
         if skin.faults.now.gain_steps > steps:
             skin.learning.stepped()
-        question, answer = asked.question, asked.answer
-        measured = replace(measured, log_z=at.untouched + asked.view.y, live=asked.view.live)
-        explained = answer.holds
-        rough = answer.fit is not None and answer.chi2 < n.MOST
-        if explained or rough:
-            settle(skin, question, answer, measured, self.now.unexplained_s)
-        went = answer.fit is not None and not len(skin.touches)  # whatever it was, it came and went within the scan
-        if (explained or rough) and not went:
-            if answer.fit is None or any(track.sure for track in skin.touches.now.tracks):
-                self._explained(skin, measured, answer.cause, roughly=not explained)
-            elif measured.whole:  # a touch that comes again and again, and never for sure, is none
-                self.now.unexplained_s += measured.span_s
-        else:
-            self._refused(skin, measured, question.y)
-            if not (explained or rough) and _strange(question, answer):
-                self.now.unexplained_s = max(self.now.unexplained_s, float(n.CHANGING_S))
-        if explained or rough:
-            self.now.candidates = []
-        elif answer.fit is not None:  # else no touch was looked for
-            ids = [skin.touches.ids[place] if place >= 0 else 0 for place in answer.kept]
-            found = zip(answer.fit.states, answer.fit.priors, ids, strict=True)
-            self.now.candidates = [OpenTouch(state, measured.middle_s + each.since_s, id) for state, each, id in found]
-        oldest_s = measured.oldest_s
-        plain = explained and not asked.changed and skin.faults.plain(oldest_s)
-        if plain and self._complete(skin, measured.live):
-            even_variance, alike = skin.drift.even_variance(measured.middle_s), skin.noise.alike(scan.part)
-            skin.quick.keep(alike, measured.middle_s, skin.touches.ids, question, answer, even_variance)
-        skin.faults.follow(asked.view, answer, explained, passed_s, measured.whole)
-        gross = skin.faults.gain_gross(measured.end_s)
-        sound, undecided = skin.faults.sound, skin.faults.now.doubt.undecided
-        if explained and measured.whole and not asked.changed:
-            undecided = undecided and not skin.asking.decide(asked, at) and skin.faults.now.doubt.undecided
-        told_apart = asked.view.contact < 0  # else the rest is off by what its size was expected to be
-        if explained and sound and told_apart and not (asked.changed or gross):
-            self._learn(skin, measured, answer, at.predicted, asked.view.grown)
-        failed = float(asked.view.failed.mean())
-        judgements += advice.judgements_of(skin.faults.states(), scan.status, failed, undecided)
-        judgements.append(judge("gap", float(skin.touches.lost), 1.0))
-        judgements.append(judge("gain", float(skin.faults.gain_stepped(oldest_s)), 1.0))
-        judgements.append(judge("gain_gross", float(gross), 1.0))
-        judgements.append(judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)))
-        if sound and answer.fit is not None:  # what drifted under the touch, as far as the scan tells it
-            grown = asked.view.grown
-            drifted = np.where(measured.live, grown * (at.predicted.covariance @ (grown * answer.pulled)), 0.0)
-            question = replace(question, y=question.y - drifted)
-        return self._said(skin, measured, question, answer, judgements, explained and not went, rough)
+        return asked
 
-    def _likeliest_age(self, skin: TaredSkin, measured: LookedAt) -> tuple[Asked, AskedScan]:
+    def _likeliest_age(self, skin: TaredSkin, measured: LookedAt) -> Asked:
         """What explains a scan: the first one after a baseline was adopted tells how far the skin has drifted. In doubt
         further: who takes drift for a touch is worse off than who is unsure.
         """
@@ -404,27 +375,24 @@ class Estimator:
         for state in skin.aged:
             skin.drift.now, skin.faults.now, self._information = state, deepcopy(faults), None
             measured.budget.left = budget
-            found.append((*self._explaining(skin, measured), state, skin.faults.now))
+            found.append((self._explaining(skin, measured), state, skin.faults.now))
         holding = [each for each in found if each[0].answer.holds] or found
         best = max((each[0].answer for each in holding), key=lambda answer: answer.score)
         nearly = [each for each in holding if _nearly_as_likely(each[0].answer, best)]
-        asked, at, skin.drift.now, skin.faults.now = nearly[-1]
+        asked, skin.drift.now, skin.faults.now = nearly[-1]
         skin.aged = []
-        return asked, at
+        return asked
 
-    def _explaining(self, skin: TaredSkin, measured: LookedAt) -> tuple[Asked, AskedScan]:
-        """What explains a scan, and the scan as it was asked about."""
+    def _explaining(self, skin: TaredSkin, measured: LookedAt) -> Asked:
         predicted = skin.drift.ahead(measured.middle_s, skin.noise.now.flicker)
         own = measured.scan, measured.log_z, measured.live, measured.whole, measured.budget
-        at = AskedScan(*own, predicted, skin.log_z0 + predicted.shift)
-        answering = Answering(self._tables, skin, measured, self.now.unexplained_s)
-        asked = skin.asking(
-            at,
+        answering = Answering(self._tables, skin, measured, predicted, self.now.unexplained_s)
+        return skin.asking(
+            AskedScan(*own, predicted, skin.log_z0 + predicted.shift),
             lambda hypotheses, view, covariance: self._question(hypotheses, skin, view, covariance, measured),
-            lambda hypotheses, question: answering.answer(hypotheses, question, predicted),
+            answering.answer,
             answering.recounted,
         )
-        return asked, at
 
     def _question(
         self, hypotheses: Hypotheses, skin: TaredSkin, view: BoardView, covariance: Array, measured: LookedAt
@@ -441,6 +409,34 @@ class Estimator:
         return question.leaving(n.FOR_FAULTS)
 
     # --- what follows ---
+
+    def _lock(self, skin: TaredSkin, measured: LookedAt, asked: Asked, transient: bool) -> None:
+        """Whether the skin is still followed: explained, or for how long it has not been."""
+        question, answer = asked.question, asked.answer
+        if transient or not answer.nearly_holds:
+            self._refused(skin, measured, question.y)
+            if not answer.nearly_holds and _strange(question, answer):
+                self.now.unexplained_s = max(self.now.unexplained_s, float(n.CHANGING_S))
+        elif answer.fit is None or any(track.sure for track in skin.touches.now.tracks):
+            self._explained(skin, measured, answer.cause, roughly=not answer.holds)
+        elif measured.whole:  # a touch that comes again and again, and never for sure, is none
+            self.now.unexplained_s += measured.span_s
+
+    def _keep_candidates(self, skin: TaredSkin, measured: LookedAt, answer: ScoredAnswer) -> None:
+        """Touches that nearly explain a scan, for the next one."""
+        if answer.nearly_holds:
+            self.now.candidates = []
+        elif answer.fit is not None:  # else no touch was looked for
+            ids = [skin.touches.ids[place] if place >= 0 else 0 for place in answer.kept]
+            found = zip(answer.fit.states, answer.fit.priors, ids, strict=True)
+            self.now.candidates = [OpenTouch(state, measured.middle_s + each.since_s, id) for state, each, id in found]
+
+    def _keep_whitening(self, skin: TaredSkin, measured: LookedAt, asked: Asked) -> None:
+        """For quick looks at the next scans, where nothing is wrong."""
+        plain = asked.answer.holds and not asked.changed and skin.faults.plain(measured.oldest_s)
+        if plain and self._complete(skin, measured.live):
+            even_variance, alike = skin.drift.even_variance(measured.middle_s), skin.noise.alike(measured.scan.part)
+            skin.quick.keep(alike, measured.middle_s, skin.touches.ids, asked.question, asked.answer, even_variance)
 
     def _explained(self, skin: TaredSkin, measured: LookedAt, cause: str, roughly: bool = False) -> None:
         self.now.unexplained_s = 0.0
@@ -462,12 +458,14 @@ class Estimator:
         if self._tables.predicted and self.now.unexplained_s > n.CHANGING_S:
             skin.hypotheses.adrift = min(n.MOST_ADRIFT, skin.hypotheses.adrift * n.ADRIFT)
 
-    def _learn(
-        self, skin: TaredSkin, measured: LookedAt, answer: ScoredAnswer, predicted: Prediction, grown: Array
-    ) -> None:
+    def _learn(self, skin: TaredSkin, measured: LookedAt, asked: Asked) -> None:
         """From untouched scans all, while touched what the touches leave open, now and then: what their response gets
-        wrong is the same from scan to scan. grown (K,): times what the skin changes by, as the board shows it.
+        wrong is the same from scan to scan. Nothing where a contact or the gain changes: the rest is off by what its
+        size was expected to be.
         """
+        answer, view, predicted = asked.answer, asked.view, asked.view.at.predicted
+        if not answer.holds or asked.changed or view.contact >= 0 or skin.faults.gain_gross(measured.end_s):
+            return
         if answer.fit is None:
             self._learn_untouched(skin, measured, answer.pulled, answer.cause)
             return
@@ -481,7 +479,7 @@ class Estimator:
         due = predicted.at_s - skin.drift.now.at_s > n.TOUCHED_LEARNS_S
         same = len(predicted.x) == len(skin.drift.now.x)  # nothing has ended or slid away
         if due and same and not answer.recounted and self._complete(skin, measured.live):
-            skin.drift.take_in_beside(predicted, answer.fit, grown)
+            skin.drift.take_in_beside(predicted, answer.fit, view.grown)
             skin.forget_looks()
 
     def _learn_untouched(self, skin: TaredSkin, measured: LookedAt, pulled: Array, cause: str) -> None:
@@ -507,6 +505,17 @@ class Estimator:
 
     # --- what is said ---
 
+    def _judged(self, skin: TaredSkin, measured: LookedAt, asked: Asked) -> list[Judgement]:
+        """What the board and lost scans leave of a scan's word."""
+        faults, failed = skin.faults, float(asked.view.failed.mean())
+        return [
+            *advice.judgements_of(faults.states(), measured.scan.status, failed, faults.now.doubt.undecided),
+            judge("gap", float(skin.touches.lost), 1.0),
+            judge("gain", float(faults.gain_stepped(measured.oldest_s)), 1.0),
+            judge("gain_gross", float(faults.gain_gross(measured.end_s)), 1.0),
+            judge("seen", n.LEAST_LIVE, max(float(measured.live.mean()), 1e-3)),
+        ]
+
     def _said(
         self,
         skin: TaredSkin,
@@ -515,25 +524,29 @@ class Estimator:
         answer: ScoredAnswer,
         judgements: list[Judgement],
         explained: bool,
-        rough: bool,
     ) -> Estimate:
-        if explained or rough:
-            unexplained = float(np.linalg.norm(answer.left)) / max(float(np.linalg.norm(question.y)), 1e-12)
-            sample_s = measured.scan.sample_ns * 1e-9
-            lasting = [track for track in skin.touches.now.tracks if track.sure and track.acts_at(sample_s)]
-            self.now.said = tuple(estimate_of(track, sample_s, measured.span_s, unexplained) for track in lasting)
-        else:
-            passed_s = (measured.scan.sample_ns - self.now.said_ns) * 1e-9
-            self.now.said = tuple(roughly(touch, passed_s) for touch in self.now.said)
+        self.now.said = self._touches_said(skin, measured, question, answer)
         self.now.said_ns = measured.scan.sample_ns
         unsure = any(not track.sure for track in skin.touches.now.tracks)
         sigma = np.sqrt(np.diag(question.covariance))
         changing = float(self._tables.predicted and (unsure or not explained))
-        left = answer.left_z2 / (max(1.0, answer.chi2) if answer.quiet else 1.0)
-        felt = max([left, *_felt(skin.touches, None if explained or rough else answer.fit)])
+        felt = max(_felt(skin.touches, answer))
         if answer.fit is not None and not self._tables.predicted:
-            felt = max(felt, skin.hypotheses.felt(question))
+            felt = max(felt, skin.hypotheses.untouched(question).left_z2)
         return self._estimate(measured, question.y, sigma, judgements, felt, changing)
+
+    def _touches_said(
+        self, skin: TaredSkin, measured: LookedAt, question: Question, answer: ScoredAnswer
+    ) -> tuple[TouchEstimate, ...]:
+        """The confirmed tracks, or those that were said last where nothing tells how they go on."""
+        sample_ns = measured.scan.sample_ns
+        if not answer.nearly_holds:
+            passed_s = (sample_ns - self.now.said_ns) * 1e-9
+            return tuple(roughly(touch, passed_s) for touch in self.now.said)
+        unexplained = float(np.linalg.norm(answer.left)) / max(float(np.linalg.norm(question.y)), 1e-12)
+        sample_s = sample_ns * 1e-9
+        lasting = [track for track in skin.touches.now.tracks if track.sure and track.acts_at(sample_s)]
+        return tuple(estimate_of(track, sample_s, measured.span_s, unexplained) for track in lasting)
 
     def _estimate(
         self,
@@ -579,9 +592,16 @@ def _strange(question: Question, answer: ScoredAnswer) -> bool:
     return left > n.STRANGE * whole
 
 
-def _felt(touches: TouchTracks, found: FoundTouches | None) -> list[float]:
-    """Squared sigmas of the touches that explain a scan; found: that do so nearly, and are none yet."""
-    if found is None:
-        return [track.z2 for track in touches.lasting]
-    variance = np.diag(found.covariance)[ACTION::STATES]
-    return list(found.states[:, ACTION] ** 2 / np.maximum(variance, 1e-18))
+def _drifted(asked: Asked) -> Array:
+    """(K,) what drifted under touches, as far as the scan tells it."""
+    view, grown = asked.view, asked.view.grown
+    return np.where(view.live, grown * (view.at.predicted.covariance @ (grown * asked.answer.pulled)), 0.0)
+
+
+def _felt(touches: TouchTracks, answer: ScoredAnswer) -> list[float]:
+    """Squared sigmas of what an answer leaves, and of the touches that explain the scan, or would."""
+    left = answer.left_z2 / (max(1.0, answer.chi2) if answer.quiet else 1.0)
+    if answer.fit is None or answer.nearly_holds:
+        return [left, *(track.z2 for track in touches.lasting)]
+    variance = np.diag(answer.fit.covariance)[ACTION::STATES]
+    return [left, *(answer.fit.states[:, ACTION] ** 2 / np.maximum(variance, 1e-18))]

@@ -6,29 +6,25 @@ from dataclasses import replace
 
 import numpy as np
 
+from models.measurement.fit import FoundTouches
 from models.measurement.touch import LOG_RADIUS
 from services.estimation.asked.looked_at import LookedAt
 from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, started_from
+from services.estimation.filter import Memory
 from services.estimation.tared import TaredSkin
+from services.estimation.touches import TouchTracks, TrackedTouch
 from services.estimation.values import numbers as n
 
 
 def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt, unexplained_s: float) -> None:
     """Take over what an answer says of the touches. unexplained_s: for how long nothing has explained the scans."""
-    touches, middle_s, span_s = skin.touches, measured.middle_s, measured.span_s
-    kept = answer.kept if answer.fit is None else touches.recognised(answer.fit, answer.kept)
-    if answer.recounted and answer.fit is not None:
-        touches.correct(answer.fit, kept)
-    gone = [k for k in range(len(touches)) if k not in kept]
-    memories = [memory for k in gone for memory in touches.released(k, measured.oldest_s)]
     if answer.fit is None:
-        touches.forget(measured.oldest_s)
+        memories = skin.touches.forget(measured.oldest_s)
     else:
-        skin.slow.forget()
-        memories += touches.settle(answer.fit, kept, middle_s, span_s, whole=measured.whole, explained=answer.explained)
-        _make_sure(skin, answer, measured)
-        rest = replace(question, keeps=0.0)
+        memories = _associate(skin, answer, answer.fit, measured)
+        _confirm(skin, answer, measured)
         if measured.whole and not (answer.recounted or measured.scan.separate):
+            rest = replace(question, keeps=0.0)
             _doubt(skin, rest, answer, measured, strange=unexplained_s > n.CHANGING_S)
     skin.remember(memories)
     wide = answer.fit is not None and answer.wide
@@ -37,26 +33,51 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         skin.forget_looks()
 
 
-def _make_sure(skin: TaredSkin, answer: ScoredAnswer, measured: LookedAt) -> None:
+def _associate(skin: TaredSkin, answer: ScoredAnswer, fit: FoundTouches, measured: LookedAt) -> list[Memory]:
+    """Tracks go on, begin or end with the touches of a fit. Returns what those that ended leave in the foam."""
+    touches = skin.touches
+    kept = touches.recognised(fit, answer.kept)
+    if answer.recounted:
+        touches.correct(fit, kept)
+    gone = [k for k in range(len(touches)) if k not in kept]
+    memories = [memory for k in gone for memory in touches.released(k, measured.oldest_s)]
+    skin.slow.forget()
+    return memories + touches.settle(fit, kept, measured, answer.explained)
+
+
+def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: LookedAt) -> None:
     """A touch is shown at once where its scan is explained with it: a rough start may be anything. One that stands by
     itself (separate) is the end, too.
     """
     if not (answer.explained or measured.scan.separate) or 2 * answer.over < n.SURE_Z2:
         return
-    least = float(n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2)
-    if measured.scan.separate:  # how many press was asked of evidence
-        least = float(n.ACTS_Z2)
-    if not skin.tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
-        least = 0.0
+    least = _least_z2(skin, answer, measured)
+    place_tells = not measured.whole and answer.cause == AS_IT_IS
     may_wait = skin.tables.predicted and not measured.scan.separate
     for track in skin.touches.now.tracks:
-        # How strongly it presses a first part hardly tells: its place and that it is there, it does.
-        placed = track.place_sd < n.PLACED and track.z2 > n.PLACED_Z2
-        told = track.z2 > least or (placed and not measured.whole and answer.cause == AS_IT_IS)
+        told = track.z2 > least or (place_tells and _placed(track))
         track.sure = track.sure or (told and not skin.faults.in_question(track.state))
-        broad = track.state[LOG_RADIUS] > np.log(n.BROAD) and track.scans < n.SURE_SCANS
-        if broad and may_wait:  # it may be two that began together, and is where neither of them is
+        if may_wait and _broad(track):
             track.sure = False
+
+
+def _least_z2(skin: TaredSkin, answer: ScoredAnswer, measured: LookedAt) -> float:
+    """Squared sigmas of its action from which a touch is shown at once."""
+    if not skin.tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
+        return 0.0
+    if measured.scan.separate:  # how many press was asked of evidence
+        return float(n.ACTS_Z2)
+    return float(n.SURE_Z2 if answer.cause == AS_IT_IS else n.DOUBT_Z2)
+
+
+def _placed(track: TrackedTouch) -> bool:
+    """How strongly it presses a first part hardly tells: its place and that it is there, it does."""
+    return track.place_sd < n.PLACED and track.z2 > n.PLACED_Z2
+
+
+def _broad(track: TrackedTouch) -> bool:
+    """Whether it may be two that began together, and is where neither of them is."""
+    return bool(track.state[LOG_RADIUS] > np.log(n.BROAD)) and track.scans < n.SURE_SCANS
 
 
 def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt, strange: bool) -> None:
@@ -68,8 +89,7 @@ def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
     meeting = touches.meeting(measured.middle_s)
     for k in reversed(range(len(touches))):
         track = touches.now.tracks[k]
-        often = track.z2 < n.DOUBT_Z2 or not track.sure
-        if track.ended or not (often or track.doubt_due):
+        if not _doubted(track):
             continue
         standing, least = touches.expected(measured.middle_s, measured.span_s), float(n.COST_TOUCH)
         if answer.fit is not None and k in meeting and len(touches) == len(answer.fit):
@@ -77,12 +97,23 @@ def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         other = skin.hypotheses.without(question, standing, k)
         if other.quiet and other.score > answer.score + least:
             none.append((other.score - least, k))
-            continue
-        needed = answer.explained and answer.cause == AS_IT_IS and 2 * (answer.score - other.score) > n.SURE_Z2
-        acts = track.z2 > n.ACTS_Z2
-        stood = needed and acts and not touches.now.watched  # what began while somebody watched may be how others begin
-        alone = len(touches) == 1  # then something touches, be its strength known or not
-        lasts = track.scans >= n.SURE_SCANS and (alone or acts) and not strange
-        track.sure = track.sure or ((stood or lasts) and not skin.faults.in_question(track.state))
+        elif not track.sure and not skin.faults.in_question(track.state):
+            track.sure = _lasts(track, touches, strange) or _needed(track, touches, answer, other)
     if none:
         touches.remove(max(none)[1])
+
+
+def _doubted(track: TrackedTouch) -> bool:
+    return not track.ended and (track.z2 < n.DOUBT_Z2 or not track.sure or track.doubt_due)
+
+
+def _needed(track: TrackedTouch, touches: TouchTracks, answer: ScoredAnswer, other: ScoredAnswer) -> bool:
+    """Whether it stood before anybody looked, and the scan needs it. other: the answer without it."""
+    if touches.now.watched or track.z2 <= n.ACTS_Z2:  # what began while somebody watched may be how others begin
+        return False
+    return answer.explained and answer.cause == AS_IT_IS and 2 * (answer.score - other.score) > n.SURE_Z2
+
+
+def _lasts(track: TrackedTouch, touches: TouchTracks, strange: bool) -> bool:
+    alone = len(touches) == 1  # then something touches, be its strength known or not
+    return track.scans >= n.SURE_SCANS and (alone or track.z2 > n.ACTS_Z2) and not strange

@@ -35,6 +35,7 @@ from models.measurement.touch import (
     is_plain,
     within_limits,
 )
+from services.estimation.asked.looked_at import LookedAt
 from services.estimation.filter import Memory
 from services.estimation.overlap import KnownCourse, gaps
 from services.estimation.values import numbers as n
@@ -225,53 +226,62 @@ class TouchTracks:
                 free.remove(nearest)
         return tuple(found)
 
-    def settle(
-        self,
-        fit: FoundTouches,
-        kept: Sequence[int],
-        at_s: float,
-        span_s: float,
-        *,
-        whole: bool,
-        explained: bool = True,
-    ) -> list[Memory]:
-        """Take over a fit. kept: of each of its touches the track that it continues; -1: it is new. whole: no value of
-        the scan was fitted before. explained: by the fit; else it is only roughly right. Returns what touches that
-        ended or moved away leave in the foam.
+    def settle(self, fit: FoundTouches, kept: Sequence[int], measured: LookedAt, explained: bool) -> list[Memory]:
+        """Take over a fit. kept: of each of its touches the track that it continues; -1: it is new. explained: by the
+        fit; else it is only roughly right. Returns what touches that ended or moved away leave in the foam.
         """
+        at_s, span_s, whole = measured.middle_s, measured.span_s, measured.whole
         before = self.now.tracks
         self.now.tracks = [before[place] if place >= 0 else self._new(fit, k, at_s) for k, place in enumerate(kept)]
         memories, meeting = list[Memory](), self.meeting(at_s)
         for k, track in enumerate(self.now.tracks):
             own = slice(STATES * k, STATES * (k + 1))
-            track.since_s = at_s + fit.priors[k].since_s
-            if track.ended:
-                track.until_s = at_s + fit.priors[k].until_s
-                if not track.ended:  # it goes on after all: that it ended was said
-                    track.id, self.now.next_id = self.now.next_id, self.now.next_id + 1
-            track.turned_s = at_s + fit.priors[k].turns_s
-            if track.sure and is_anywhere(fit.priors[k]):  # found anew: it may be another one, or none
-                track.scans = 0
+            self._take_prior(track, fit.priors[k], at_s)
             _update(track, fit.states[k], fit.covariance[own, own], at_s, span_s, whole)
             if whole and k not in meeting:  # what two have in common is no outline of one
                 _learn(track, fit, k)
-            if explained and not track.ended:
+            if explained:
                 memories += self._held(track, at_s, span_s, whole)
-            if not track.ended and fit.priors[k].until_s < np.inf:
-                track.at_once = True
-                memories += self.released(k, at_s + fit.priors[k].until_s)
-            if not track.ended and _has_ended(track, span_s):
-                track.until_s = at_s + span_s / 2
-                track.at_once = track.turned_s < np.inf or -track.state[RATE] * span_s > n.GOES * track.held
-                memories += self._memory(track, track.until_s, 1.0)
+            memories += self._ending(k, fit.priors[k], at_s, span_s)
         if -1 in kept:
-            for track, place in zip(self.now.tracks, kept, strict=True):
-                if place >= 0 and track.scans <= n.SURE_SCANS:
-                    _forget_size(track, fit.priors[kept.index(-1)])
+            self._divide(kept, fit.priors[kept.index(-1)])
         self.now.tracks = [track for track in self.now.tracks if track.sure or not track.ended]
         if whole and explained:
             self._follow(at_s)
         return memories
+
+    def _take_prior(self, track: TrackedTouch, prior: TouchPrior, at_s: float) -> None:
+        """When it began, changed and ended, and whether it is the one that it was, as a fit around at_s took it."""
+        if track.sure and is_anywhere(prior):  # found anew: it may be another one, or none
+            track.scans = 0
+        track.since_s, track.turned_s = at_s + prior.since_s, at_s + prior.turns_s
+        if not track.ended:
+            return
+        track.until_s = at_s + prior.until_s
+        if not track.ended:  # it goes on after all: that it ended was said
+            track.id, self.now.next_id = self.now.next_id, self.now.next_id + 1
+
+    def _ending(self, place: int, prior: TouchPrior, at_s: float, span_s: float) -> list[Memory]:
+        """Whether a touch ended within the scan, by its fit or by what is left of it. Returns what it leaves."""
+        track = self.now.tracks[place]
+        if track.ended:
+            return []
+        if prior.until_s < np.inf:
+            track.at_once = True
+            return self.released(place, at_s + prior.until_s)
+        if not _has_ended(track, span_s):
+            return []
+        track.at_once = track.turned_s < np.inf or -track.state[RATE] * span_s > n.GOES * track.held
+        return self.released(place, at_s + span_s / 2)
+
+    def _divide(self, kept: Sequence[int], free: TouchPrior) -> None:
+        """Those that have just come were taken for what now are two: of their radius and outline nothing is known but
+        what any touch has, as a new one, `free`, has it.
+        """
+        for track, place in zip(self.now.tracks, kept, strict=True):
+            if place >= 0 and track.scans <= n.SURE_SCANS:
+                track.log_radius, track.log_radius_sd = float(free.mean[LOG_RADIUS]), float(free.sd[LOG_RADIUS])
+                track.shape, track.shape_variance = np.zeros(len(SHAPE_SDS)), SHAPE_SDS**2
 
     def _follow(self, at_s: float) -> None:
         tracks = self.lasting
@@ -332,6 +342,8 @@ class TouchTracks:
         """Take note of what presses, and where. Of a touch that slid away returns what the place remembers where it
         stayed. A fit that does not explain its scan must not get here: it is anywhere while a touch is released.
         """
+        if track.ended:
+            return []
         acts, now_s = float(track.state[ACTION]), at_s + span_s / 2
         goes = min(acts, float(acts + track.state[RATE] * span_s / 2)) <= n.GOES * track.held
         stayed_s = max(0.0, now_s - track.stayed_since_s)
@@ -449,14 +461,6 @@ def _learn(track: TrackedTouch, fit: FoundTouches, k: int) -> None:
     track.shape, track.shape_variance = fit.shapes[k].copy(), fit.shape_variance[k].copy()
     if is_plain(fit.priors[k]):  # that of a disc was not asked
         track.shape_variance = SHAPE_SDS**2
-
-
-def _forget_size(track: TrackedTouch, free: TouchPrior) -> None:
-    """It has just come, and was taken for what now are two: nothing is known of its radius and outline but what any
-    touch has.
-    """
-    track.log_radius, track.log_radius_sd = float(free.mean[LOG_RADIUS]), float(free.sd[LOG_RADIUS])
-    track.shape, track.shape_variance = np.zeros(len(SHAPE_SDS)), SHAPE_SDS**2
 
 
 def _action_at(state: Array, covariance: Array, after_s: float) -> tuple[float, float]:

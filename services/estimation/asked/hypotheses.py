@@ -40,6 +40,7 @@ from services.estimation.asked.question import (
     DRIFT,
     MEMORY,
     NOISE,
+    Priors,
     Question,
     ScoredAnswer,
     likeliest,
@@ -70,6 +71,32 @@ class AChange:
     left: float
 
 
+@dataclass(frozen=True)
+class Going:
+    """A touch that ends at once, tried at several instants of a scan."""
+
+    ends_s: Array  # (n,) from the middle of the scan; the first is its begin
+    ramp_s: float  # for which it goes
+    beside: Array  # (K,) relative change while it lasts, by all touches
+    gone: Array  # (K, n) what is missing of that
+
+    def instant(self, at: int) -> float:
+        """Of an end; -inf: before the scan."""
+        return -np.inf if at == 0 and self.ramp_s == AT_ONCE_S else float(self.ends_s[at])
+
+
+def _goings(course: TouchCourse, question: Question, prior: TouchPrior, own: Array, others: Array) -> Iterator[Going]:
+    """own, others (K,): relative change by this touch as it stands, and by the other ones."""
+    ends_s = np.concatenate([[-0.5 * question.span_s], question.instants])
+    if prior.until_s < np.inf:
+        own = course.columns(prior.start[None], [replace(prior, until_s=np.inf)]).mean
+        ends_s = np.append(ends_s, np.inf)
+    beside = others + own
+    for ramp_s in RAMPS_S:
+        acts = np.clip(0.5 + (ends_s - question.times_s[:, None]) / ramp_s, 0.0, 1.0)
+        yield Going(ends_s, ramp_s, beside, own[:, None] * (acts - 1))
+
+
 class Hypotheses:
     """Of one skin."""
 
@@ -98,18 +125,11 @@ class Hypotheses:
 
     # --- nothing touches ---
 
-    def untouched(self, question: Question, cause: str = AS_IT_IS) -> ScoredAnswer | None:
-        """The answer that nothing touches; None where this skin has no such cause, or foam no such memory."""
-        white = question.white
-        if cause:
-            more = self._more(question, cause, question.y)
-            if more is None:
-                return None
-            white = Whitening.of(question.covariance + more)
+    def untouched(self, question: Question, cause: str = AS_IT_IS, more: Array | None = None) -> ScoredAnswer:
+        """The answer that nothing touches; more (K, K): what a cause adds to the covariance."""
+        white = question.white if more is None else Whitening.of(question.covariance + more)
         residual = white(question.y)
         pulled = white.w.T @ residual
-        if cause == MEMORY and not self._drift.may_remember(pulled):
-            return None
         z2 = max(self.left_over.best(question, pulled, white)[0], fresh(question, pulled, white))
         score = white.log_density - 0.5 * float(residual @ residual) + COSTS[cause]
         chi2 = float(residual @ residual) / max(int(question.live.sum()), 1)
@@ -117,37 +137,38 @@ class Hypotheses:
             z2 = max(z2, float(n.FALSE_ALARM_Z2 / n.QUIET) * chi2)
         return ScoredAnswer(cause, None, (), chi2, z2, score, white, pulled, question.y)
 
+    def _untouched(self, question: Question, causes: Sequence[str]) -> list[ScoredAnswer]:
+        """The same, also by each of the causes that this skin has, where foam may remember as much."""
+        added = [(cause, self._more(question, cause, question.y)) for cause in causes]
+        found = [self.untouched(question, cause, more) for cause, more in added if more is not None]
+        return [self.untouched(question), *(answer for answer in found if self._may_be(answer))]
+
+    def _may_be(self, answer: ScoredAnswer) -> bool:
+        """Whether foam may remember what an answer says that it does."""
+        return answer.cause != MEMORY or self._drift.may_remember(answer.pulled)
+
     # --- something does ---
 
     def glance(self, question: Question) -> ScoredAnswer:
         """The likeliest answer that nothing touches, without a search."""
-        return likeliest(self._untouched(question))
-
-    def _untouched(self, question: Question) -> list[ScoredAnswer]:
-        """That nothing touches, by each cause that this skin has."""
-        causes = AS_IT_IS, *self._wider
-        return [answer for cause in causes if (answer := self.untouched(question, cause)) is not None]
-
-    def felt(self, question: Question) -> float:
-        """Squared sigmas of whatever touches."""
-        return self._nothing(question, AS_IT_IS).left_z2
+        return likeliest(self._untouched(question, self._wider))
 
     def untold(self, question: Question, pressed: Array, wider: bool) -> ScoredAnswer:
         """The same of a skin whose touches no response tells: else something touches. pressed (K,): change by what did
         so lately, of which foam may remember a share. wider: whether causes are asked that own more than the filter.
         """
-        found = self.glance(question) if wider else self._nothing(question, AS_IT_IS)
+        found = self.glance(question) if wider else self.untouched(question)
         if found.quiet or not pressed.any():
             return found
         column, white = np.where(question.live, pressed, 0.0), question.white
         along = white(column)
         share = float(along @ white(question.y)) / max(float(along @ along), LEAST_ACTION)
-        again = self._nothing(replace(question, y=question.y - share * column), AS_IT_IS)
+        again = self.untouched(replace(question, y=question.y - share * column))
         return again if again.quiet and abs(share) < n.MEMORY_MOST else found
 
     def slowly(self, question: Question) -> ScoredAnswer | None:
         """Touches that came while nothing was seen to touch, strong enough to be none of the field's own unevenness."""
-        nothing = self._nothing(question, AS_IT_IS)
+        nothing = self.untouched(question)
         if nothing.left_z2 < n.FALSE_ALARM_Z2:
             return None
         found = self._from_nothing(question)
@@ -156,25 +177,26 @@ class Hypotheses:
             return None
         return best if float(best.fit.states[:, ACTION].sum()) > n.START_SEEN else None
 
-    def ask(self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]) -> ScoredAnswer:
+    def ask(self, question: Question, standing: Priors, loose: Priors) -> ScoredAnswer:
         """The likeliest answer. standing, loose: what is known of the touches that there were, as they were and where
         they may have begun to move or to change.
         """
-        answers = self._of_standing(question, standing, loose) if len(standing) else self._of_none(question)
+        if standing:
+            answers = self._of_standing(question, standing, loose)
+        else:
+            answers = [*self._untouched(question, self._wider), *self._from_nothing(question)]
         if not _settled(question, answers):
             answers += self._of_anything(question, standing, answers)
         best = likeliest(answers)
-        if len(standing):
+        if standing:
             return best
         return replace(best, over=best.score - max(answer.score for answer in answers if answer.fit is None))
 
-    def narrow(self, question: Question, standing: Sequence[TouchPrior]) -> ScoredAnswer:
+    def narrow(self, question: Question, standing: Priors) -> ScoredAnswer:
         """The answer that touches stay as they are, by a response that is wrong by no more than it should be."""
         return self.fitted(question, standing, tuple(range(len(standing))), n.STEPS_WARM, wide=False)
 
-    def goes_on(
-        self, question: Question, standing: Sequence[TouchPrior], known: KnownWhitening, turned: Turned
-    ) -> ScoredAnswer:
+    def goes_on(self, question: Question, standing: Priors, known: KnownWhitening, turned: Turned) -> ScoredAnswer:
         """The answer that touches stay as they are; known, turned: of a moment ago, when they did."""
         everyone = tuple(range(len(standing)))
         return self.fitted(question, standing, everyone, n.STEPS_HELD, known=known, turned=turned)
@@ -202,28 +224,16 @@ class Hypotheses:
         assert found is not None
         return found
 
-    def without(self, question: Question, standing: Sequence[TouchPrior], place: int) -> ScoredAnswer:
+    def without(self, question: Question, standing: Priors, place: int) -> ScoredAnswer:
         """The answer that one of the touches is none: there is nothing, or it is drift, or what foam remembers."""
         kept = tuple(k for k in range(len(standing)) if k != place)
+        if not kept:
+            return likeliest(self._untouched(question, (DRIFT, MEMORY)))
         priors = [standing[k] for k in kept]
-        answers = list[ScoredAnswer]()
-        for cause in (AS_IT_IS, DRIFT, MEMORY):
-            if not kept:
-                answers += [nothing] if (nothing := self.untouched(question, cause)) is not None else []
-            elif cause:
-                answers += self.with_cause(question, priors, kept, cause, question.y, n.STEPS_WARM)
-            else:
-                answers.append(self.fitted(question, priors, kept, n.STEPS_WARM))
+        answers = [self.fitted(question, priors, kept, n.STEPS_WARM)]
+        for cause in (DRIFT, MEMORY):
+            answers += self.with_cause(question, priors, kept, cause, question.y, n.STEPS_WARM)
         return likeliest(answers)
-
-    def _nothing(self, question: Question, cause: str) -> ScoredAnswer:
-        """As `untouched`, of a cause that this skin has."""
-        answer = self.untouched(question, cause)
-        assert answer is not None
-        return answer
-
-    def _of_none(self, question: Question) -> list[ScoredAnswer]:
-        return [*self._untouched(question), *self._from_nothing(question)]
 
     def _from_nothing(self, question: Question) -> list[ScoredAnswer]:
         """Touches where none were: first those that the scan before left open, as a search has no steps for all."""
@@ -234,44 +244,45 @@ class Hypotheses:
         settled = question.spent or (count == 1 and _settled(question, found))
         return found if settled else [*found, *self.search(question)]
 
-    def _of_standing(
-        self, question: Question, standing: Sequence[TouchPrior], loose: Sequence[TouchPrior]
-    ) -> list[ScoredAnswer]:
+    def _of_standing(self, question: Question, standing: Priors, loose: Priors) -> list[ScoredAnswer]:
+        answers = list[ScoredAnswer]()
+        for further in self._of_changes(question, standing, loose):
+            answers += further
+            if _settled(question, answers):
+                return answers
+        return answers + self._beside_standing(question, standing, loose, answers)
+
+    def _of_changes(self, question: Question, standing: Priors, loose: Priors) -> Iterator[list[ScoredAnswer]]:
+        """The same touches, one way after the other: as they were, gone, begun, changed or ended at once, moved."""
         everyone = tuple(range(len(standing)))
-        answers = [self.fitted(question, standing, everyone, n.STEPS_WARM)]
-        if _settled(question, answers):
-            return answers
-        if (nothing := self.untouched(question)) is not None:  # costs no step
-            answers.append(nothing)
-            if _settled(question, answers):
-                return answers
+        unchanged = self.fitted(question, standing, everyone, n.STEPS_WARM)
+        yield [unchanged]
+        yield [self.untouched(question)]  # costs no step
         if -1 in question.places:
-            answers += self._going_on(question, loose)
-            if _settled(question, answers):
-                return answers
+            yield self._going_on(question, loose)
         if (begun := self._begun_otherwise(question, standing)) is not None:
-            answers.append(self.fitted(question, begun, everyone, n.STEPS_COLD))
-            if _settled(question, answers):
-                return answers
-        end, turn = self._changes(question, standing, answers[0])
+            yield [self.fitted(question, begun, everyone, n.STEPS_COLD)]
+        end, turn = self._changes(question, standing, unchanged)
         late = end is None or end.at_s > _turns_s(question) + TURN_STEPS[0]
         ways = (self._released, end), (self._turned, turn)
         for how, change in reversed(ways) if late else ways:
-            answers += how(question, standing, change)
-            if _settled(question, answers):
-                return answers
-        answers.append(self.fitted(question, loose, everyone, n.STEPS_COLD))
-        if _settled(question, answers):
-            return answers
+            yield how(question, standing, change)
+        yield [self.fitted(question, loose, everyone, n.STEPS_COLD)]
+
+    def _beside_standing(
+        self, question: Question, standing: Priors, loose: Priors, before: Sequence[ScoredAnswer]
+    ) -> list[ScoredAnswer]:
+        """Further touches beside those that stand, or a disturbance; before: the answers without."""
+        everyone = tuple(range(len(standing)))
         expected = self.fitted(question, standing, everyone, 0)
         causes = CAUSE_STEPS * len(self._wider) * len(loose)  # a search must not spend theirs
-        answers += self.search(replace(question, keeps=question.keeps + causes), expected)
-        best = likeliest(answers)
+        found = self.search(replace(question, keeps=question.keeps + causes), expected)
+        left = likeliest([*before, *found]).left
         for cause in self._affordable(question):
-            answers += self.with_cause(question, loose, everyone, cause, best.left)
-        return answers
+            found += self.with_cause(question, loose, everyone, cause, left)
+        return found
 
-    def _going_on(self, question: Question, loose: Sequence[TouchPrior]) -> list[ScoredAnswer]:
+    def _going_on(self, question: Question, loose: Priors) -> list[ScoredAnswer]:
         """What nearly explained the part before, a step further: those that stand, and the new ones beside them; or
         foam remembers more of what went.
         """
@@ -286,9 +297,7 @@ class Hypotheses:
         everyone = tuple(range(len(loose)))
         return [found, *self.with_cause(question, loose, everyone, MEMORY, question.y, n.STEPS_WARM)]
 
-    def _of_anything(
-        self, question: Question, standing: Sequence[TouchPrior], before: Sequence[ScoredAnswer]
-    ) -> list[ScoredAnswer]:
+    def _of_anything(self, question: Question, standing: Priors, before: Sequence[ScoredAnswer]) -> list[ScoredAnswer]:
         """Where what was known does not help: touches from nothing, beside a disturbance, by a wrong response."""
         found = self._from_nothing(question) if standing else []
         if _settled(question, found):
@@ -311,7 +320,7 @@ class Hypotheses:
     def with_cause(
         self,
         question: Question,
-        priors: Sequence[TouchPrior],
+        priors: Priors,
         kept: tuple[int, ...],
         cause: str,
         left: Array,
@@ -323,7 +332,7 @@ class Hypotheses:
             return []
         wider = replace(question, covariance=question.covariance + more)
         answer = self.fitted(wider, priors, kept, most_steps, cause)
-        return [] if cause == MEMORY and not self._drift.may_remember(answer.pulled) else [answer]
+        return [answer] if self._may_be(answer) else []
 
     def _more(self, question: Question, cause: str, left: Array) -> Array | None:
         """(K, K) what a cause adds to the covariance; left (K,): the residual that it is to explain."""
@@ -352,7 +361,7 @@ class Hypotheses:
     def fitted(
         self,
         question: Question,
-        priors: Sequence[TouchPrior],
+        priors: Priors,
         kept: tuple[int, ...],
         most_steps: float,
         cause: str = AS_IT_IS,
@@ -378,45 +387,45 @@ class Hypotheses:
         )
 
     def search(
-        self, question: Question, before: ScoredAnswer | None = None, outlined: Sequence[TouchPrior] | None = None
+        self, question: Question, before: ScoredAnswer | None = None, outlined: Priors | None = None
     ) -> list[ScoredAnswer]:
         """Further touches than those of an answer, one after the other: plain discs find them, their own outlines and
         evidence decide. outlined: the touches of that answer, free to be no discs; None: as it has them.
         """
-        found = list[ScoredAnswer]()
-        pulled, white, score = question.white.solve(question.y), question.white, -np.inf
-        fit, kept = None, tuple[int, ...]()
-        if before is not None:
-            pulled, white, score, fit, kept = before.pulled, before.white, before.score, before.fit, before.kept
-        full = started_from(fit) if outlined is None else list(outlined)
-        while (len(fit) if fit else 0) < n.MOST_TOUCHES and not question.spent:
-            z2, disc, action, since_s = self.left_over.best(question, pulled, white, fit, question.onsets)
-            if z2 < question.least_z2:
-                break
-            x, y = self.grid.discs[disc, PLACE]
-            new = replace(anywhere(x, y, action, question.span_s), since_s=since_s)
-            full, kept = [*full, new], (*kept, -1)
-            if fit is None and question.part and since_s > 0:  # the next parts tell one outline from two discs
-                found.append(self.fitted(question, full, kept, n.STEPS_COLD))
+        found, discs = list[ScoredAnswer](), _unsearched(question) if before is None else before
+        priors = started_from(discs.fit) if outlined is None else list(outlined)
+        while (new := self._next_disc(question, discs)) is not None:
+            priors, kept = [*priors, new], (*discs.kept, -1)
+            if (
+                discs.fit is None and question.part and new.since_s > 0
+            ):  # the next parts tell one outline from two discs
+                found.append(self.fitted(question, priors, kept, n.STEPS_COLD))
                 if found[0].explained:
                     break
-            disc_alone = self.fitted(question, [*started_from(fit), plain(new)], kept, n.STEPS_COLD)
-            if disc_alone.score < score + question.least_gain:
+            more = self.fitted(question, [*started_from(discs.fit), plain(new)], kept, n.STEPS_COLD)
+            if more.score < discs.score + question.least_gain:
                 break
-            score, fit = disc_alone.score, disc_alone.fit
-            assert fit is not None
-            pulled, white = disc_alone.pulled, disc_alone.white
-            found += self._outlined(question, full, kept, disc_alone)
-            if disc_alone.explained and not question.by_evidence:
+            discs = more
+            found += self._outlined(question, priors, discs)
+            if discs.explained and not question.by_evidence:
                 break
         return found
 
-    def _outlined(
-        self, question: Question, priors: Sequence[TouchPrior], kept: tuple[int, ...], discs: ScoredAnswer
-    ) -> list[ScoredAnswer]:
+    def _next_disc(self, question: Question, discs: ScoredAnswer) -> TouchPrior | None:
+        """The likeliest one in what others leave; None where it would not be seen, or may not be looked for."""
+        if discs.count >= n.MOST_TOUCHES or question.spent:
+            return None
+        z2, disc, action, since_s = self.left_over.best(question, discs.pulled, discs.white, discs.fit, question.onsets)
+        if z2 < question.least_z2:
+            return None
+        x, y = self.grid.discs[disc, PLACE]
+        return replace(anywhere(x, y, action, question.span_s), since_s=since_s)
+
+    def _outlined(self, question: Question, priors: Priors, discs: ScoredAnswer) -> list[ScoredAnswer]:
         """Touches that were found as discs with outlines of their own. By evidence each may be a disc, or odder than
         outlines go.
         """
+        kept = discs.kept
         outlined = self.fitted(question, started(priors, discs.fit), kept, n.STEPS_COLD)
         assert outlined.fit is not None
         found = [outlined]
@@ -448,7 +457,7 @@ class Hypotheses:
         one_less = self.fitted(question, priors, kept, n.STEPS_COLD)
         return [one_less, *self._wide(question, one_less)]
 
-    def _begun_otherwise(self, question: Question, standing: Sequence[TouchPrior]) -> list[TouchPrior] | None:
+    def _begun_otherwise(self, question: Question, standing: Priors) -> list[TouchPrior] | None:
         """A touch that began within these values did so at another instant than the first of them told; None where
         none did. The instant is the likeliest, whatever the action.
         """
@@ -475,7 +484,7 @@ class Hypotheses:
             priors[k] = replace(priors[k], since_s=float(instants[at]))
         return priors
 
-    def _turned(self, question: Question, standing: Sequence[TouchPrior], turn: AChange | None) -> list[ScoredAnswer]:
+    def _turned(self, question: Question, standing: Priors, turn: AChange | None) -> list[ScoredAnswer]:
         """How strongly they act changed at once: one of them in mid-scan, or any at its end, as they go or are pressed
         harder.
         """
@@ -495,7 +504,7 @@ class Hypotheses:
             return []
         return [self.fitted(question, priors, tuple(range(len(priors))), n.STEPS_COLD)]
 
-    def _released(self, question: Question, standing: Sequence[TouchPrior], end: AChange | None) -> list[ScoredAnswer]:
+    def _released(self, question: Question, standing: Priors, end: AChange | None) -> list[ScoredAnswer]:
         """One of the touches ended at once within the scan, or before it; empty where none did."""
         if end is None:
             return []
@@ -509,44 +518,33 @@ class Hypotheses:
             del priors[end.touch], kept[end.touch]
         if priors:
             return [self.fitted(question, priors, tuple(kept), n.STEPS_COLD)]
-        nothing = self.untouched(question)
-        return [] if nothing is None else [nothing]
+        return [self.untouched(question)]
 
     def _changes(
-        self, question: Question, standing: Sequence[TouchPrior], answer: ScoredAnswer
+        self, question: Question, standing: Priors, answer: ScoredAnswer
     ) -> tuple[AChange | None, AChange | None]:
         """The end of one of the touches that leaves least of a scan, and the other change of one that leaves less than
         half as much; None where none leaves half of what they leave as they are. One that has ended did so at another
         instant than the first values after it told, or not at all.
         """
         course = TouchCourse(self.response, question.times_s, question.span_s)
-        starts = np.stack([prior.start for prior in standing])
-        each = [course.columns(starts[k : k + 1], [prior]).mean for k, prior in enumerate(standing)]
+        each = [course.columns(prior.start[None], [prior]).mean for prior in standing]
         whole = np.sum(each, axis=0)
-        within = np.concatenate([[-0.5 * question.span_s], question.instants])
         end, turn = None, None
         least = turned = 0.5 * self._unlike(question, answer, whole[:, None])[0]
         for k, prior in enumerate(standing):
-            lasting, ends = each[k], within
-            if prior.until_s < np.inf:
-                lasting = course.columns(starts[k : k + 1], [replace(prior, until_s=np.inf)]).mean
-                ends = np.append(within, np.inf)
-            beside = (whole - each[k])[:, None] + lasting[:, None]
-            for ramp_s in RAMPS_S:
-                acts = np.clip(0.5 + (ends - question.times_s[:, None]) / ramp_s, 0.0, 1.0)
-                gone = lasting[:, None] * (acts - 1)
-                chi2 = self._unlike(question, answer, beside + gone)
+            for going in _goings(course, question, prior, each[k], whole - each[k]):
+                chi2 = self._unlike(question, answer, going.beside[:, None] + going.gone)
                 at = int(chi2.argmin())
                 if chi2[at] < least:
-                    before = at == 0 and ramp_s == AT_ONCE_S
-                    end, least = AChange(k, -np.inf if before else float(ends[at]), 0.0), float(chi2[at])
+                    end, least = AChange(k, going.instant(at), 0.0), float(chi2[at])
                 if prior.until_s < np.inf:
                     continue
-                share = self._share(question, answer, beside[:, 0], gone)
-                chi2 = self._unlike(question, answer, beside + share * gone)
+                share = self._share(question, answer, going.beside, going.gone)
+                chi2 = self._unlike(question, answer, going.beside[:, None] + share * going.gone)
                 at = int(chi2.argmin())
                 if chi2[at] < min(turned, 0.5 * least, 0.5 * chi2[0]):  # by more than one that changed before the scan
-                    turn, turned = AChange(k, float(ends[at]), 1 - float(share[at])), float(chi2[at])
+                    turn, turned = AChange(k, float(going.ends_s[at]), 1 - float(share[at])), float(chi2[at])
         return end, turn if turned < 0.5 * least or end is None else None
 
     def _share(self, question: Question, answer: ScoredAnswer, change: Array, gone: Array) -> Array:
@@ -562,6 +560,12 @@ class Hypotheses:
         left = np.where(question.live, question.y, 0.0)[:, None] - np.log1p(np.maximum(changes, LEAST_MEAN))
         left[~question.live] = 0.0
         return np.asarray(np.sum(answer.white(left) ** 2, axis=0))
+
+
+def _unsearched(question: Question) -> ScoredAnswer:
+    """That nothing touches, not scored: any touch is likelier."""
+    white, y = question.white, question.y
+    return ScoredAnswer(AS_IT_IS, None, (), np.inf, np.inf, -np.inf, white, white.solve(y), y)
 
 
 def _turns_s(question: Question) -> float:

@@ -15,6 +15,7 @@ from models.measurement.touch import ACTION, PLACE, TouchPrior, anywhere
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
+Priors = Sequence[TouchPrior]
 
 ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
@@ -135,6 +136,11 @@ class ScoredAnswer:
     def holds(self) -> bool:
         """Whether it explains its scan, with touches or without."""
         return self.quiet if self.fit is None else self.explained
+
+    @property
+    def nearly_holds(self) -> bool:
+        """Whether it does, or its touches explain the scan roughly: their places hold."""
+        return self.holds or (self.fit is not None and self.chi2 < n.MOST)
 
     def information(self, column: Array) -> float:
         """Of what else may add to the scan by this column (K,): 1 / variance of its size."""

@@ -5,9 +5,9 @@ one touch looks like two.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from copy import copy
-from itertools import takewhile
+from itertools import product, takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anywhere, plain
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.asked.question import (
+    Priors,
     Question,
     ScoredAnswer,
     begun_as,
@@ -45,34 +46,39 @@ class Recount:
 
     def __call__(self, question: Question, answer: ScoredAnswer) -> ScoredAnswer | None:
         """Other touches than those of an answer, where they are likelier: None where they are not."""
-        assert answer.fit is not None
-        ask, new = self._hypotheses, (-1,) * len(answer.fit)
-        begun = begun_as(answer.fit, question.span_s)
-        same = [ask.fitted(question, begun, new, n.STEPS_COLD)]
-        if answer.wide:
-            same.append(ask.fitted(question, begun, new, n.STEPS_COLD, wide=True))
-        if answer.cause:
-            same += ask.with_cause(question, begun, new, answer.cause, answer.left)
+        fit = answer.fit
+        assert fit is not None
+        ask, new = self._hypotheses, (-1,) * len(fit)
+        begun = begun_as(fit, question.span_s)
+        same = self._same(question, answer, begun)
         discs = ask.fitted(question, [plain(prior) for prior in begun], new, n.STEPS_COLD)
-        found = [discs, *ask.search(question, discs, begun)]
         enough = max(each.score for each in (*same, discs)) + self._least_gain
+        found = [discs, *ask.search(question, discs, begun)]
         assert same[0].fit is not None
         if (pair := neighbours(same[0].fit.states, new)) is not None:
             found += ask.merged(question, same[0], *pair)
         elif not any(other.explained and other.score > enough for other in found):
-            oddest = np.argsort([-oddness(shape) for shape in answer.fit.shapes])
+            oddest = np.argsort([-oddness(shape) for shape in fit.shapes])
             for one in takewhile(lambda _: not question.spent, oddest):
                 found += self._halved(question, begun, discs, int(one))
         if not any(other.explained for other in found):
             found += ask.search(question)
-        others = [other for other in found if other.explained and _others(other.fit, answer.fit)]
+        others = [other for other in found if other.explained and _others(other.fit, fit)]
         if not others or likeliest(others).score < enough:
             return None
         return likeliest(others)
 
-    def _halved(
-        self, question: Question, begun: Sequence[TouchPrior], discs: ScoredAnswer, one: int
-    ) -> list[ScoredAnswer]:
+    def _same(self, question: Question, answer: ScoredAnswer, begun: Priors) -> list[ScoredAnswer]:
+        """As many touches, as they are and by what else the answer explains its scan with."""
+        ask, new = self._hypotheses, (-1,) * len(begun)
+        found = [ask.fitted(question, begun, new, n.STEPS_COLD)]
+        if answer.wide:
+            found.append(ask.fitted(question, begun, new, n.STEPS_COLD, wide=True))
+        if answer.cause:
+            found += ask.with_cause(question, begun, new, answer.cause, answer.left)
+        return found
+
+    def _halved(self, question: Question, begun: Priors, discs: ScoredAnswer, one: int) -> list[ScoredAnswer]:
         """Two discs instead of one: a disc beside one that lies between two leads to neither. begun: the touches of
         those discs, with their outlines.
         """
@@ -96,20 +102,23 @@ class Recount:
         white, response = question.white, self._hypotheses.response
         others = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) for k, s in enumerate(fit.states) if k != one]
         target = white(np.where(question.live, np.expm1(question.y) - sum(others), 0.0))
-        (x, y), radius = fit.states[one, PLACE], float(np.exp(fit.states[one, LOG_RADIUS]))
-        small = float(fit.states[one, LOG_RADIUS]) - 0.5 * np.log(2.0)
-        best, least = list[TouchPrior](), np.inf
-        for angle in HALVED_ANGLES:
-            for apart in HALVED_APART:
-                way = apart * radius * np.array([np.cos(angle), np.sin(angle)])
-                places = [(x + side * way[0], y + side * way[1]) for side in (-1, 1)]
-                both = np.stack([response(*place, small) for place in places], axis=1)
-                columns = white(np.where(question.live[:, None], both, 0.0))
-                actions, left = nnls(columns, target)
-                if left < least and actions.min() > 0:
-                    least = left
-                    best = [anywhere(*at, acts, question.span_s) for at, acts in zip(places, actions, strict=True)]
-        return best
+        halves, least = list[TouchPrior](), np.inf
+        for places, radius in _pairs(fit.states[one]):
+            both = np.stack([response(*place, radius) for place in places], axis=1)
+            actions, left = nnls(white(np.where(question.live[:, None], both, 0.0)), target)
+            if left < least and actions.min() > 0:
+                least = left
+                halves = [anywhere(*at, acts, question.span_s) for at, acts in zip(places, actions, strict=True)]
+        return halves
+
+
+def _pairs(state: Array) -> Iterator[tuple[list[tuple[float, float]], float]]:
+    """Places of two discs on either side of the middle of one (7,), and log radius of each: both have its area."""
+    (x, y), radius = state[PLACE], float(np.exp(state[LOG_RADIUS]))
+    small = float(state[LOG_RADIUS]) - 0.5 * np.log(2.0)
+    for angle, apart in product(HALVED_ANGLES, HALVED_APART):
+        way = apart * radius * np.array([np.cos(angle), np.sin(angle)])
+        yield [(x + side * way[0], y + side * way[1]) for side in (-1, 1)], small
 
 
 def _others(fit: FoundTouches | None, than: FoundTouches) -> bool:

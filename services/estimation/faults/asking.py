@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,7 +16,7 @@ from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import ACTION, TouchPrior
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, begun_as
-from services.estimation.faults.board import AskedScan, BoardFaults, BoardView, as_they_stand
+from services.estimation.faults.board import Asked, AskedScan, BoardFaults, BoardView, as_they_stand
 from services.estimation.faults.doubt import ContactDoubt
 from services.estimation.faults.wires import WireFault
 from services.estimation.touches import TouchTracks
@@ -28,26 +28,11 @@ Answering = Callable[[Hypotheses, Question], ScoredAnswer]
 Recounting = Callable[[Hypotheses, Question, ScoredAnswer], ScoredAnswer]
 
 
-@dataclass(frozen=True)
-class Asked:
-    """What explains a scan."""
-
-    view: BoardView
-    question: Question
-    answer: ScoredAnswer
-    changed: bool = False  # a fault was found: the next scan is the first that it is taken off
-
-
 class FaultAsking:
     """Of one skin."""
 
     def __init__(
-        self,
-        tables: SkinTables,
-        noise: NoiseModel,
-        touches: TouchTracks,
-        hypotheses: Hypotheses,
-        faults: BoardFaults,
+        self, tables: SkinTables, noise: NoiseModel, touches: TouchTracks, hypotheses: Hypotheses, faults: BoardFaults
     ) -> None:
         self._tables, self._noise, self._touches = tables, noise, touches
         self._hypotheses, self._faults = hypotheses, faults
@@ -111,8 +96,7 @@ class FaultAsking:
         if found.view.slopes is not None:
             touched = np.maximum(found.view.slopes @ touched, LEAST_MEAN)
         nearby = found.view.through(nearby)
-        other = self._faults.explained_by_fault(found.view, found.question, found.answer, touched, nearby, ask)
-        return found if other is None else Asked(found.view, *other, changed=True)
+        return self._faults.explained_by_fault(found, touched, nearby, ask) or found
 
     def _doubted(self, found: Asked, at: AskedScan) -> Asked:
         """Is a touch on an electrode its contact impedance? Asked at some ages, when it has become weak, and when it
@@ -132,24 +116,25 @@ class FaultAsking:
             del standing[k], loose[k]
             touched, nearby = self._change(standing, at, but=k)
             ask = partial(self._with, standing, loose)
-            other = self._faults.explained_by_fault(
-                found.view, found.question, found.answer, touched, nearby, ask, doubted=True
-            )
+            other = self._faults.explained_by_fault(found, touched, nearby, ask, doubted=True)
             if other is not None:
                 self._touches.remove(k)
-                return Asked(found.view, *other, changed=True)
+                return other
         return found
 
-    def decide(self, found: Asked, at: AskedScan) -> bool:
-        """Whether a contact that has changed is a touch on its electrode, once a scan is explained with it: one that is
-        new, or that stands by now.
+    def decide(self, found: Asked) -> None:
+        """Whether a contact that has changed is a touch on its electrode, once a whole scan is explained with it: one
+        that is new, or that stands by now.
         """
+        at = found.view.at
+        if not (found.answer.holds and at.whole) or found.changed:
+            return
         if not self._faults.now.doubt.undecided or self._faults.now.wire is not None:
-            return False
+            return
         skin, own = self._covariances(at)
         touched, nearby = self._change(self._touches.expected(at.middle_s, at.span_s), at)
         misfit = self._tables.misfit_of(float(touched @ touched))
-        touch = self._contact_doubt(found.view, found.question, found.answer, skin + nearby + misfit, own)
+        touch = self._contact_doubt(found, skin + nearby + misfit, own)
         if touch is not None:
             self._faults.drop_contact()
             self._touches.tell(touch, at.middle_s, at.span_s)
@@ -157,7 +142,6 @@ class FaultAsking:
             for track in self._touches.now.tracks:
                 track.told = self._faults.on_electrode(track.state)
                 track.sure = track.sure or track.told
-        return self._faults.now.contact < 0
 
     def _covariances(self, at: AskedScan) -> tuple[Array, Array]:
         """(K, K) of what changes with the skin, and of what the measurements add."""
@@ -168,9 +152,7 @@ class FaultAsking:
     def _with(self, standing: list[TouchPrior], loose: list[TouchPrior], question: Question) -> ScoredAnswer:
         if standing:
             return self._hypotheses.ask(replace(question, candidates=(), places=()), standing, loose)
-        quiet = self._hypotheses.untouched(question)
-        assert quiet is not None
-        return quiet
+        return self._hypotheses.untouched(question)
 
     def _change(self, priors: Sequence[TouchPrior], at: AskedScan, but: int = -1) -> tuple[Array, Array]:
         """(K,) what touches that stand do to each |Z|, and (K, K) the covariance of what they may have changed by: a

@@ -38,6 +38,7 @@ from services.estimation.values import numbers as n
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Ask = Callable[[Question], ScoredAnswer]
+Change = ContactChange | GainChange
 
 LEAST = -0.95  # relative: nothing takes all of an impedance away
 SCAN_S = 0.044
@@ -122,6 +123,16 @@ class BoardView:
     def through(self, covariance: Array) -> Array:
         """(K, K) of the skin's log |Z|, as the wires show it."""
         return covariance if self.slopes is None else np.asarray(self.slopes @ covariance @ self.slopes.T)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What explains a scan."""
+
+    view: BoardView
+    question: Question
+    answer: ScoredAnswer
+    changed: bool = False  # a fault was found: the next scan is the first that it is taken off
 
 
 class BoardFaults:
@@ -272,58 +283,57 @@ class BoardFaults:
         return float(answer.pulled.sum()) ** 2 / answer.information(even)
 
     def explained_by_fault(
-        self,
-        view: BoardView,
-        question: Question,
-        answer: ScoredAnswer,
-        touched: Array,
-        nearby: Array,
-        ask: Ask,
-        doubted: bool = False,
-    ) -> tuple[Question, ScoredAnswer] | None:
-        """A contact or the gain that has changed, if that is likelier. touched (K,): relative change by touches that
-        stand; nearby (K, K): covariance of what they may have changed by; ask: the likeliest touches of a question.
-        doubted: without one that stands and lies on an electrode.
+        self, without: Asked, touched: Array, nearby: Array, ask: Ask, doubted: bool = False
+    ) -> Asked | None:
+        """A contact or the gain that has changed, if that is likelier than what explains a scan without. touched (K,):
+        relative change by touches that stand; nearby (K, K): covariance of what they may have changed by; ask: the
+        likeliest touches of a question. doubted: without one that stands and lies on an electrode.
         """
+        view, question, answer = without.view, without.question, without.answer
         if question.budget.left <= 0:  # what is left open is asked again with the scans that follow
             return None
-        best, sure = None, answer.score + (n.COST_TOUCH + n.COST_SMALL if doubted else self._sure(answer))
         columns, any_touch = self._columns_now, view.through(self._any_touch)
         if view.slopes is not None:
             columns = columns.through(view.slopes)
         changes = self._likeliest(question, columns, any_touch, touched, nearby, unexplained=not answer.holds)
         question = replace(question, keeps=0.0)
+        best, least = None, answer.score + (n.COST_TOUCH + n.COST_SMALL if doubted else self._sure(answer))
         for k, change in enumerate(changes, 1):
             asked, column = self._with(question.leaving(1 - k / len(changes)), columns, change)
             found = ask(asked)
-            cost = 0.0 if self._goes_on(change, view) else _cost(change)
-            if found.score + cost < sure or not self._apart(change, found):
-                continue
-            if self._beside(change, found) and found.score + cost < answer.score + n.FAULT_SURE:
-                continue  # a touch takes the contact along: both are not likelier for being seldom touches
-            if isinstance(change, GainChange) and abs(float(column @ found.pulled)) * n.GAIN_CHANGES < n.GAIN_LEAST:
-                continue  # the touches of the answer explain all of it
-            if isinstance(change, ContactChange) and not _told(column, found):
-                continue
-            plainly = self._tells and found.chi2 < n.MOST and found.score + cost > answer.score + n.WIRE_SURE
-            if not (found.holds or plainly):
-                continue
-            best, sure = (change, column, asked, found), found.score + cost
+            score = found.score + (0.0 if self._goes_on(change, view) else _cost(change))
+            if score >= least and self._passes(change, column, found, score, answer):
+                best, least = (change, column, asked, found), score
         if best is None:
             return None
         change, column, asked, found = best
         self._take(view, change, float(column @ found.pulled))
         if isinstance(change, ContactChange):
             self.now.doubt.beside = self._beside(change, found)
-        return asked, found
+        return Asked(view, asked, found, changed=True)
 
-    def _beside(self, change: ContactChange | GainChange, answer: ScoredAnswer) -> bool:
+    def _passes(self, change: Change, column: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer) -> bool:
+        """Whether a change may be believed that is likely enough. column (K,): of unit variance of what it may be;
+        found: the answer with it, and its score; answer: the one without.
+        """
+        if not self._apart(change, found):
+            return False
+        if self._beside(change, found) and score < answer.score + n.FAULT_SURE:
+            return False  # a touch takes the contact along: both are not likelier for being seldom touches
+        if isinstance(change, GainChange):  # else the touches of the answer explain all of it
+            told = abs(float(column @ found.pulled)) * n.GAIN_CHANGES >= n.GAIN_LEAST
+        else:
+            told = _told(column, found)
+        plainly = self._tells and found.chi2 < n.MOST and score > answer.score + n.WIRE_SURE
+        return told and (found.holds or plainly)
+
+    def _beside(self, change: Change, answer: ScoredAnswer) -> bool:
         """Whether a touch of the answer may change the contact impedance that is said to change."""
         if isinstance(change, GainChange) or answer.fit is None:
             return False
         return any(self._reaches(state, change.electrode) for state in answer.fit.states)
 
-    def _goes_on(self, change: ContactChange | GainChange, view: BoardView) -> bool:
+    def _goes_on(self, change: Change, view: BoardView) -> bool:
         """Whether it is the contact that has begun to change within this scan."""
         return isinstance(change, ContactChange) and change.electrode == self.now.contact and self.began_within(view)
 
@@ -374,11 +384,11 @@ class BoardFaults:
         touched: Array,
         nearby: Array,
         unexplained: bool,
-    ) -> list[ContactChange | GainChange]:
+    ) -> list[Change]:
         """At most three changes that may explain a scan: with the touches as they stand, with any touches, or, where
         nothing explains it, without those that stood; and whatever touches: a gain changes all measurements alike.
         """
-        found = list[ContactChange | GainChange]()
+        found = list[Change]()
         tried = [(touched, nearby, float(n.MOST)), (touched, nearby + any_touch, np.inf)]
         if unexplained and touched.any():
             tried.insert(0, (np.zeros_like(touched), np.zeros_like(nearby), float(n.MOST)))
@@ -399,16 +409,14 @@ class BoardFaults:
             found.append(gain_change(scan, -np.inf))
         return found
 
-    def _every(self, scan: Unexplained, columns: ContactColumns) -> list[ContactChange | GainChange]:
+    def _every(self, scan: Unexplained, columns: ContactColumns) -> list[Change]:
         gains = [gain_change(scan, -np.inf), gain_change(scan, gain_onset(scan))]
-        found: list[ContactChange | GainChange] = [gain for gain in gains if abs(gain.log_factor) > n.GAIN_LEAST]
+        found: list[Change] = [gain for gain in gains if abs(gain.log_factor) > n.GAIN_LEAST]
         if not self._predicted:
             return found or [gains[0]]
         return [*found, *columns.likeliest(scan)]
 
-    def _with(
-        self, question: Question, of_contacts: ContactColumns, change: ContactChange | GainChange
-    ) -> tuple[Question, Array]:
+    def _with(self, question: Question, of_contacts: ContactColumns, change: Change) -> tuple[Question, Array]:
         """The question with a change of any size, and its column (K,) of unit variance."""
         acts = np.asarray(question.live & (question.times_s >= change.since_s), float)
         if isinstance(change, GainChange):
@@ -421,7 +429,7 @@ class BoardFaults:
         wider[np.diag_indices_from(wider)] += misfit**2
         return replace(question, y=np.where(question.live, y, 0.0), covariance=wider), columns[:, 0]
 
-    def _apart(self, change: ContactChange | GainChange, answer: ScoredAnswer) -> bool:
+    def _apart(self, change: Change, answer: ScoredAnswer) -> bool:
         """An electrode under a touch that changes is not named: what it does is the touch's. One that stood may change
         from now on where a scan is not explained.
         """
@@ -435,7 +443,7 @@ class BoardFaults:
                 return False
         return True
 
-    def _take(self, view: BoardView, change: ContactChange | GainChange, told: float) -> None:
+    def _take(self, view: BoardView, change: Change, told: float) -> None:
         """told: of the change, in sigmas of its prior."""
         now = self.now
         since_s = view.at.middle_s + change.since_s
@@ -470,10 +478,10 @@ class BoardFaults:
 
     # --- what follows ---
 
-    def follow(self, view: BoardView, answer: ScoredAnswer, explained: bool, passed_s: float, whole: bool) -> None:
+    def follow(self, view: BoardView, answer: ScoredAnswer, passed_s: float, whole: bool) -> None:
         """A changed contact goes on changing, is well again, or is the skin's own; what explains nothing goes."""
         now = self.now
-        if not explained:
+        if not answer.holds:
             now.unexplained_scans += whole
             if now.unexplained_scans >= n.UNEXPLAINED_SCANS:
                 now.wire, now.unexplained_scans = None, 0
@@ -573,11 +581,11 @@ def _told(column: Array, answer: ScoredAnswer) -> bool:
     return float(column @ answer.pulled) ** 2 > n.ACTS_Z2 * max(1 - answer.information(column), 0.0)
 
 
-def _cost(change: ContactChange | GainChange) -> float:
+def _cost(change: Change) -> float:
     return float(n.COST_GAIN if isinstance(change, GainChange) else n.COST_CONTACT)
 
 
-def _what(change: ContactChange | GainChange) -> int:
+def _what(change: Change) -> int:
     return change.electrode if isinstance(change, ContactChange) else -1
 
 

@@ -7,26 +7,23 @@ import numpy as np
 from models.bundle import Bundle
 from services.estimation.faults.wires import all_pairs
 
+PREDICTED = ("touches at the first start", "drift under a touch", "touches that change during a scan")
+
 
 def skipped(bundle: Bundle) -> dict[str, str]:
     """Returns the checks that cannot be made, each with the reason, from the bundle's pattern and normalisation."""
-    pattern, found = np.asarray(bundle.pattern), {}
-    measured = bundle.matrices.normalisation != "model"
+    pattern = np.asarray(bundle.pattern)
     own = (pattern[:, 0] == pattern[:, 2]) & (pattern[:, 1] == pattern[:, 3])
-    nothing_predicted = "a measured bundle predicts no impedances"
-    if not own.any():
-        found["shorts between electrodes"] = "no pair senses where it drives"
-    if measured or not all_pairs(pattern):
-        why = nothing_predicted if measured else "not all pairs of electrodes are measured"
-        found["exchanged wires and stuck multiplexers"] = why
-    if measured or not own.all():
-        found["contacts that change"] = nothing_predicted if measured else "not all pairs sense where they drive"
-    if measured or own.sum() < len(own) / 2:
-        found["changes that no touch can make"] = nothing_predicted if measured else "few pairs sense where they drive"
-    if measured:
-        for check in ("touches at the first start", "drift under a touch", "touches that change during a scan"):
-            found[check] = nothing_predicted
-    return found
+    predicting = [  # check, whether the pattern allows it, what it lacks otherwise
+        ("exchanged wires and stuck multiplexers", all_pairs(pattern), "not all pairs of electrodes are measured"),
+        ("contacts that change", own.all(), "not all pairs sense where they drive"),
+        ("changes that no touch can make", own.sum() >= len(own) / 2, "few pairs sense where they drive"),
+        *((check, True, "") for check in PREDICTED),
+    ]
+    if bundle.matrices.normalisation != "model":
+        predicting = [(check, False, "a measured bundle predicts no impedances") for check, _, _ in predicting]
+    checks = [("shorts between electrodes", own.any(), "no pair senses where it drives"), *predicting]
+    return {check: why for check, made, why in checks if not made}
 
 
 def sentence(bundle: Bundle) -> str:

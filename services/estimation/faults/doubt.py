@@ -17,7 +17,7 @@ from models.measurement.fit import FoundTouches
 from models.measurement.responses.tables import SkinTables
 from services.estimation.asked.hypotheses import Hypotheses
 from services.estimation.asked.question import AS_IT_IS, MEMORY, Question, ScoredAnswer, StepBudget
-from services.estimation.faults.board import LEAST, BoardFaults, BoardView
+from services.estimation.faults.board import LEAST, Asked, BoardFaults, BoardView
 from services.estimation.faults.impedance import ContactChange, ContactColumns, Unexplained
 from services.estimation.values import numbers as n
 
@@ -34,19 +34,15 @@ class ContactDoubt:
     def __init__(self, tables: SkinTables, hypotheses: Hypotheses, faults: BoardFaults) -> None:
         self._tables, self._hypotheses, self._faults = tables, hypotheses, faults
 
-    def __call__(
-        self, view: BoardView, question: Question, answer: ScoredAnswer, skin: Array, own: Array
-    ) -> FoundTouches | None:
+    def __call__(self, found: Asked, skin: Array, own: Array) -> FoundTouches | None:
         """A whole scan that was explained with a changed contact. skin, own: as for `BoardView.covariance`, what
         touches that stand may do included. Returns the touch that it is.
         """
-        faults = self._faults.now
+        view, faults = found.view, self._faults.now
         doubt = faults.doubt
-        if not doubt.undecided or answer.cause not in (AS_IT_IS, MEMORY):
+        if not doubt.undecided or found.answer.cause not in (AS_IT_IS, MEMORY) or self._changes(view):
             return None
-        if self._changes(view):
-            return None
-        doubt.add(self._over(view, answer))
+        doubt.add(self._over(view, found.answer))
         if doubt.scans not in ASKED and (doubt.scans < ASKED[-1] or doubt.scans % EVERY):
             return None
         assert doubt.over is not None
@@ -54,7 +50,7 @@ class ContactDoubt:
         scale = np.exp(np.where(view.live, view.log_z - view.sound - y, 0.0))
         covariance = (skin + own / doubt.scans) * scale[:, None] * scale
         leave_out(covariance, view.live)
-        asked = replace(question, y=y, covariance=covariance, budget=StepBudget(n.MOST_STEPS), keeps=0.0)
+        asked = replace(found.question, y=y, covariance=covariance, budget=StepBudget(n.MOST_STEPS), keeps=0.0)
         contact = self._contact(asked)
         nothing = asked.white.log_likelihood(y)
         if contact.size < 0 or contact.score - nothing < n.FALSE_ALARM_Z2 / 2:  # no touch would be seen in it
