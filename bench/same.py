@@ -1,8 +1,8 @@
 """What every stage makes of fixed scans, field by field: what `skin dev same` compares between two checkouts.
 
-The scans are simulated anew from fixed seeds, in simulated time and one thread; nothing in what is kept is a time that
-was measured. `python -m bench.same FILE [TEXT]` plays the scenes with TEXT in their names, in an environment as
-tests/pinned.py makes it, and keeps them: a line for each frame, or file of rows.
+The scans are simulated anew from fixed seeds, in simulated time and one thread; no time that was measured is in what is
+written. `python -m bench.same FILE [TEXT]` plays the scenes with TEXT in their names, in an environment as
+tests/pinned.py makes it, and writes them: a line for each frame, or file of rows.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ Lines = list[dict[str, str]]  # field -> what it holds, with a digest where that
 
 def text_of(value: Any) -> str:
     """Short, and another one where a single bit differs."""
-    said, bits = repr(value), b""
+    text, bits = repr(value), b""
     if isinstance(value, np.ndarray):
-        said, bits = f"{value.dtype} {value.shape}", value.tobytes()
+        text, bits = f"{value.dtype} {value.shape}", value.tobytes()
         if value.dtype.kind in "fc":
-            said += f" of norm {np.linalg.norm(value[np.isfinite(value)])!r}"
-    if not bits and len(said) <= SHOWN:
-        return said
-    return f"{said[:SHOWN]} #{hashlib.sha256(said.encode() + bits).hexdigest()[:16]}"
+            text += f" of norm {np.linalg.norm(value[np.isfinite(value)])!r}"
+    if not bits and len(text) <= SHOWN:
+        return text
+    return f"{text[:SHOWN]} #{hashlib.sha256(text.encode() + bits).hexdigest()[:16]}"
 
 
 def line_of(frame: Frame) -> dict[str, str]:
@@ -73,8 +73,8 @@ def line_of(frame: Frame) -> dict[str, str]:
     topic, _, packed = pack(frame).partition(b"\0")
     fields = msgpack.unpackb(packed)
     sample = fields["stamps"].get("sample", 0)
-    told = {name: text_of(arrays(value)) for name, value in fields.items() if name not in MEASURED}
-    return {"topic": f"{topic.decode()} at {sample} ns"} | told
+    texts = {name: text_of(arrays(value)) for name, value in fields.items() if name not in MEASURED}
+    return {"topic": f"{topic.decode()} at {sample} ns"} | texts
 
 
 def _noted(lines: Lines, stage: Stage, frame: Frame) -> list[Frame]:
@@ -149,8 +149,8 @@ def scenes(lines: Lines) -> Iterator[tuple[str, Callable[[], object]]]:
         yield f"fault {fault.title}, {SCANS[k % 2]}", partial(_fault, lines, fault, SCANS[k % 2])
 
 
-def keep(path: Path, only: str = "") -> None:
-    """Play the scenes whose names have `only` in them."""
+def record(path: Path, only: str = "") -> None:
+    """Play the scenes whose names have `only` in them, and write their lines."""
     lines: Lines = []
     noting = mock.patch.object(Pipeline, "_passed", partial(_noted, lines))
     with gzip.open(path, "wt", compresslevel=1, encoding="utf-8") as file, private_runtime(), noting:
@@ -164,7 +164,7 @@ def keep(path: Path, only: str = "") -> None:
 # --- beside each other ---
 
 
-def kept(path: Path, only: str = "") -> dict[str, list[str]]:
+def read(path: Path, only: str = "") -> dict[str, list[str]]:
     """The lines of each scene."""
     found: dict[str, list[str]] = {}
     with gzip.open(path, "rt", encoding="utf-8") as file:
@@ -191,4 +191,4 @@ def difference(ours: Sequence[str], theirs: Sequence[str]) -> str:
 
 
 if __name__ == "__main__":
-    keep(Path(sys.argv[1]), *sys.argv[2:3])
+    record(Path(sys.argv[1]), *sys.argv[2:3])

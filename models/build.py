@@ -270,7 +270,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def build(target: BuildTarget, args: argparse.Namespace, began: float) -> None:
     """The whole bundle. Raises TooLittle."""
-    plan = Plan.of(args.minutes) if args.minutes else QUICK if args.quick else FULL
+    plan = QUICK if args.quick else Plan.of(args.minutes) if args.minutes else FULL
     matrices, held_out = _prepared(target, args, plan)
     pre, made, entries = PreReconstructor(matrices), dict[str, bytes](), dict[str, Any]()
     print(f"physics ready after {time.perf_counter() - began:.0f} s", flush=True)
@@ -347,7 +347,7 @@ def _is_enough(
     held_out: samples.Samples,
     entries: dict[str, Any],
 ) -> bool:
-    """Whether the bundle is to be written; the verdict goes into `said`. Raises TooLittle."""
+    """Whether the bundle is to be written; the verdict goes into `entries`. Raises TooLittle."""
     spent, without = entries["training"], verdict.one_step(held_out, pre, target.own)
     if target.own is not None:
         judged = verdict.judge_registered(entries["held_out"], spent["batches"], spent["minutes"], without)

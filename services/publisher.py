@@ -331,8 +331,8 @@ class Publishing(Stage):
             self._end_all()
         self._next_id = more + int(state["next_id"])
         self._ids = {int(touch): (more + int(number), int(born_ns)) for touch, number, born_ns in state["ids"]}
-        self._shown = [_contact(c, more) for c in state["shown"]]
-        self._untold += [_contact(c, more) for c in state["untold"]]
+        self._shown = [_restored(c, more) for c in state["shown"]]
+        self._untold += [_restored(c, more) for c in state["untold"]]
         watched = [int(each) for each in state["watched_ns"]]
         self._watched_ns = (watched[0], watched[1]) if watched else None
         self.lasting.load(state["lasting"])
@@ -349,10 +349,10 @@ class Publishing(Stage):
         return Health("WARN" if problem else "OK", [problem] if problem else [], dict(self._counters))
 
 
-def _contact(said: Mapping[str, Any], more: int) -> Contact:
-    """One of a state, its number raised by `more`. Contacts of earlier versions had fields that are gone."""
-    known = {each.name: said[each.name] for each in fields(Contact) if each.name in said}
-    return Contact(**(known | {"id": more + int(said["id"])}))
+def _restored(state: Mapping[str, Any], more: int) -> Contact:
+    """A contact of a state, its number raised by `more`; what else the state has of it is left out."""
+    known = {each.name: state[each.name] for each in fields(Contact) if each.name in state}
+    return Contact(**(known | {"id": more + int(state["id"])}))
 
 
 def _given(state: Mapping[str, Any]) -> list[Any]:

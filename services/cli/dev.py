@@ -40,8 +40,8 @@ def same(
         if against is not None and against.is_dir():
             theirs = Path(folder, "theirs")
             _play(against.resolve(), theirs, only)
-        found = scenes.kept(ours)
-        others = found if theirs is None else scenes.kept(theirs, only)
+        found = scenes.read(ours)
+        others = found if theirs is None else scenes.read(theirs, only)
     differing = 0
     for name in found | others:
         lines = found.get(name, [])

@@ -127,7 +127,7 @@ def _judged_by_itself(hypotheses: Hypotheses, question: Question, standing: Prio
     anew = hypotheses.ask(question.leaving(0.5), (), ())
     before = hypotheses.ask(question, standing, loose)
     kept = sum(place >= 0 for place in before.kept)
-    vouched = replace(before, score=before.score + n.COST_TOUCH * kept)
+    vouched = replace(before, score=before.score + question.touch_log_prior * kept)
     return max((anew, vouched), key=lambda answer: (answer.holds, answer.score))
 
 

@@ -209,7 +209,7 @@ class Estimator:
         if self.skin is None:
             self._first()
             return self._unknown(measured, judgements)
-        self._pass(self.skin, measured, gap_s)
+        self._bridge(self.skin, measured, gap_s)
         if (slowly := self._came_slowly(self.skin, measured)) is not None:
             return self._held(self.skin, measured, *slowly, judgements)
         seen, noticed, self.now.noticed = self._glanced(self.skin, measured), self.now.noticed, False
@@ -234,7 +234,7 @@ class Estimator:
             self.taring.offer(scan, measurable, measured.middle_s)
         return measured
 
-    def _pass(self, skin: TaredSkin, measured: LookedAt, gap_s: float) -> None:
+    def _bridge(self, skin: TaredSkin, measured: LookedAt, gap_s: float) -> None:
         """The time since the scan before: that a baseline was kept, or that scans were lost."""
         if self.now.adopted_age_s is not None:
             for state in skin.aged:
@@ -335,7 +335,7 @@ class Estimator:
         if answer.nearly_holds:
             settle(skin, question, answer, measured, self.now.unexplained_s)
         transient = answer.fit is not None and not len(skin.touches)  # it came and went within the scan
-        self._lock(skin, measured, asked, transient)
+        self._update_lock(skin, measured, asked, transient)
         self._keep_candidates(skin, measured, answer)
         self._keep_whitening(skin, measured, asked)
         skin.faults.follow(view, answer, passed_s, measured.whole)
@@ -410,7 +410,7 @@ class Estimator:
 
     # --- what follows ---
 
-    def _lock(self, skin: TaredSkin, measured: LookedAt, asked: Asked, transient: bool) -> None:
+    def _update_lock(self, skin: TaredSkin, measured: LookedAt, asked: Asked, transient: bool) -> None:
         """Whether the skin is still followed: explained, or for how long it has not been."""
         question, answer = asked.question, asked.answer
         if transient or not answer.nearly_holds:

@@ -54,8 +54,8 @@ NO_ROS2 = (
 
 
 NO_FIT = (
-    "`radius_m` alone: touches are no longer refined by a fit of their shape, as the measurements tell place, size and "
-    "force without one. Take {} out, and `indenter` too where no radius is known"
+    "`radius_m` alone: no fit of their shape refines touches, as the measurements tell place, size and force without "
+    "one. Take {} out, and `indenter` too where no radius is known"
 )
 
 

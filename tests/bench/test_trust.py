@@ -194,8 +194,8 @@ def test_the_truth_says_nothing_of_what_a_world_hides() -> None:
 
 def test_the_same_is_the_same_and_another_number_is_seen(tmp_path, monkeypatch):
     def lines():
-        same.keep(tmp_path / "kept", "adaptive")
-        return same.kept(tmp_path / "kept")["recording adaptive"]
+        same.record(tmp_path / "lines", "adaptive")
+        return same.read(tmp_path / "lines")["recording adaptive"]
 
     found = lines()
     assert len(found) > 500 and not same.difference(found, lines())

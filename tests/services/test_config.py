@@ -39,7 +39,7 @@ OF_A_SKIN = [
     ({"tare": {"frames": True}}, "tare.frames: found True"),
     ({"surface": {"kind": "cylinder", "radius_m": True}}, "radius_m: found True"),
     ({"rtia_ohm": 1e300}, "skins.palm.rtia_ohm: found 1e+300; allowed: less than or equal to 1000000"),
-    ({"indenter": {"kind": "any"}}, "indenter: found {'kind': 'any'}; allowed: `radius_m` alone: touches are no lo"),
+    ({"indenter": {"kind": "any"}}, "indenter: found {'kind': 'any'}; allowed: `radius_m` alone: no fit of their"),
     ({"indenter": {"kind": "circle", "refine": True}}, "Take `kind` and `refine` out, and `indenter` too where no"),
     ({"frame_id": "palm\x1b[2J"}, r"skins.palm.frame_id: found 'palm\x1b[2J'; allowed: text without control"),
 ]

@@ -72,20 +72,22 @@ class AChange:
 
 
 @dataclass(frozen=True)
-class Going:
-    """A touch that ends at once, tried at several instants of a scan."""
+class Releases:
+    """Of one touch, at once, at each of several instants of a scan."""
 
     ends_s: Array  # (n,) from the middle of the scan; the first is its begin
     ramp_s: float  # for which it goes
     beside: Array  # (K,) relative change while it lasts, by all touches
-    gone: Array  # (K, n) what is missing of that
+    missing: Array  # (K, n) of that, after each
 
     def instant(self, at: int) -> float:
         """Of an end; -inf: before the scan."""
         return -np.inf if at == 0 and self.ramp_s == AT_ONCE_S else float(self.ends_s[at])
 
 
-def _goings(course: TouchCourse, question: Question, prior: TouchPrior, own: Array, others: Array) -> Iterator[Going]:
+def _releases(
+    course: TouchCourse, question: Question, prior: TouchPrior, own: Array, others: Array
+) -> Iterator[Releases]:
     """own, others (K,): relative change by this touch as it stands, and by the other ones."""
     ends_s = np.concatenate([[-0.5 * question.span_s], question.instants])
     if prior.until_s < np.inf:
@@ -94,7 +96,7 @@ def _goings(course: TouchCourse, question: Question, prior: TouchPrior, own: Arr
     beside = others + own
     for ramp_s in RAMPS_S:
         acts = np.clip(0.5 + (ends_s - question.times_s[:, None]) / ramp_s, 0.0, 1.0)
-        yield Going(ends_s, ramp_s, beside, own[:, None] * (acts - 1))
+        yield Releases(ends_s, ramp_s, beside, own[:, None] * (acts - 1))
 
 
 class Hypotheses:
@@ -259,7 +261,7 @@ class Hypotheses:
         yield [unchanged]
         yield [self.untouched(question)]  # costs no step
         if -1 in question.places:
-            yield self._going_on(question, loose)
+            yield self._continued(question, loose)
         if (begun := self._begun_otherwise(question, standing)) is not None:
             yield [self.fitted(question, begun, everyone, n.STEPS_COLD)]
         end, turn = self._changes(question, standing, unchanged)
@@ -282,7 +284,7 @@ class Hypotheses:
             found += self.with_cause(question, loose, everyone, cause, left)
         return found
 
-    def _going_on(self, question: Question, loose: Priors) -> list[ScoredAnswer]:
+    def _continued(self, question: Question, loose: Priors) -> list[ScoredAnswer]:
         """What nearly explained the part before, a step further: those that stand, and the new ones beside them; or
         foam remembers more of what went.
         """
@@ -396,9 +398,8 @@ class Hypotheses:
         priors = started_from(discs.fit) if outlined is None else list(outlined)
         while (new := self._next_disc(question, discs)) is not None:
             priors, kept = [*priors, new], (*discs.kept, -1)
-            if (
-                discs.fit is None and question.part and new.since_s > 0
-            ):  # the next parts tell one outline from two discs
+            # The next parts tell one outline from two discs.
+            if discs.fit is None and question.part and new.since_s > 0:
                 found.append(self.fitted(question, priors, kept, n.STEPS_COLD))
                 if found[0].explained:
                     break
@@ -533,18 +534,18 @@ class Hypotheses:
         end, turn = None, None
         least = turned = 0.5 * self._unlike(question, answer, whole[:, None])[0]
         for k, prior in enumerate(standing):
-            for going in _goings(course, question, prior, each[k], whole - each[k]):
-                chi2 = self._unlike(question, answer, going.beside[:, None] + going.gone)
+            for tried in _releases(course, question, prior, each[k], whole - each[k]):
+                chi2 = self._unlike(question, answer, tried.beside[:, None] + tried.missing)
                 at = int(chi2.argmin())
                 if chi2[at] < least:
-                    end, least = AChange(k, going.instant(at), 0.0), float(chi2[at])
+                    end, least = AChange(k, tried.instant(at), 0.0), float(chi2[at])
                 if prior.until_s < np.inf:
                     continue
-                share = self._share(question, answer, going.beside, going.gone)
-                chi2 = self._unlike(question, answer, going.beside[:, None] + share * going.gone)
+                share = self._share(question, answer, tried.beside, tried.missing)
+                chi2 = self._unlike(question, answer, tried.beside[:, None] + share * tried.missing)
                 at = int(chi2.argmin())
                 if chi2[at] < min(turned, 0.5 * least, 0.5 * chi2[0]):  # by more than one that changed before the scan
-                    turn, turned = AChange(k, float(going.ends_s[at]), 1 - float(share[at])), float(chi2[at])
+                    turn, turned = AChange(k, float(tried.ends_s[at]), 1 - float(share[at])), float(chi2[at])
         return end, turn if turned < 0.5 * least or end is None else None
 
     def _share(self, question: Question, answer: ScoredAnswer, change: Array, gone: Array) -> Array:
