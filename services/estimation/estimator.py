@@ -41,7 +41,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 20  # of a kept state
+LAYOUT = 21  # of a kept state
 
 
 @dataclass
@@ -538,15 +538,21 @@ class Estimator:
     def _touches_said(
         self, skin: TaredSkin, measured: LookedAt, question: Question, answer: ScoredAnswer
     ) -> tuple[TouchEstimate, ...]:
-        """The confirmed tracks, or those that were said last where nothing tells how they go on."""
-        sample_ns = measured.scan.sample_ns
+        """The confirmed tracks; roughly, those that were said last where nothing tells how they go on, or whether they
+        are one.
+        """
+        sample_ns, now = measured.scan.sample_ns, skin.touches.now
+        passed_s = (sample_ns - self.now.said_ns) * 1e-9
         if not answer.nearly_holds:
-            passed_s = (sample_ns - self.now.said_ns) * 1e-9
             return tuple(roughly(touch, passed_s) for touch in self.now.said)
         unexplained = float(np.linalg.norm(answer.left)) / max(float(np.linalg.norm(question.y)), 1e-12)
         sample_s = sample_ns * 1e-9
-        lasting = [track for track in skin.touches.now.tracks if track.sure and track.acts_at(sample_s)]
-        return tuple(estimate_of(track, sample_s, measured.span_s, unexplained) for track in lasting)
+        lasting = [track for track in now.tracks if track.sure and track.acts_at(sample_s)]
+        open_ids = [track.id for track in (*now.tracks, *now.dropped) if not track.sure]
+        return (
+            *(estimate_of(track, sample_s, measured.span_s, unexplained) for track in lasting),
+            *(roughly(touch, passed_s) for touch in self.now.said if touch.id in open_ids),
+        )
 
     def _estimate(
         self,

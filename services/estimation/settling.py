@@ -26,6 +26,8 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         if measured.whole and not (answer.recounted or measured.scan.separate):
             rest = replace(question, keeps=0.0)
             _doubt(skin, rest, answer, measured, strange=unexplained_s > n.CHANGING_S)
+        if answer.explained and all(track.sure for track in skin.touches.now.tracks):
+            skin.touches.now.dropped = []
     skin.remember(memories)
     wide = answer.fit is not None and answer.wide
     if answer.explained and wide != skin.hypotheses.wide:
@@ -95,7 +97,7 @@ def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         if answer.fit is not None and k in meeting and len(touches) == len(answer.fit):
             standing, least = started_from(answer.fit), -least  # it is known by itself: it would have ended
         other = skin.hypotheses.without(question, standing, k)
-        if other.quiet and other.score > answer.score + least:
+        if other.quiet and other.score > answer.score + least and touches.stay(other.fit, other.kept):
             none.append((other.score - least, k))
         elif not track.sure and not skin.faults.in_question(track.state):
             track.sure = _lasts(track, touches, strange) or _needed(track, touches, answer, other)

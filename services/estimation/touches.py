@@ -105,6 +105,7 @@ class TouchesState:
     """All that changes."""
 
     tracks: list[TrackedTouch] = field(default_factory=list)
+    dropped: list[TrackedTouch] = field(default_factory=list)  # of late, as vague: what is found there anew is theirs
     next_id: int = 1
     watched: bool = True  # the scan before was looked at: what a scan shows now began meanwhile
 
@@ -177,17 +178,20 @@ class TouchTracks:
         """
         tracks = self.now.tracks
         self.now.tracks = [t for t in tracks if t.sure or (t.scans and not in_question(t.state))]
-        return [t for t in tracks if all(t is not kept for kept in self.now.tracks)]
+        vague = [t for t in tracks if all(t is not kept for kept in self.now.tracks)]
+        self.now.dropped += vague
+        return vague
 
     def forget(self, at_s: float) -> list[Memory]:
         """Nobody knows any more what touches. Returns what those that there were may have left in the foam."""
         memories = [memory for place in range(len(self)) for memory in self.released(place, at_s)]
-        self.now.tracks = []
+        self.now.tracks, self.now.dropped = [], []
         return memories
 
     def drop_the_past(self, oldest_s: float) -> None:
-        """Forget what ended before the oldest value that a window holds."""
+        """Forget what ended before the oldest value that a window holds, or was dropped and not found again."""
         self.now.tracks = [track for track in self.now.tracks if track.until_s > oldest_s - SUDDEN_REACH_S]
+        self.now.dropped = [track for track in self.now.dropped if track.at_s > oldest_s - n.CHANGING_S]
 
     def expected(self, at_s: float, span_s: float, loose: bool = False) -> list[TouchPrior]:
         """What is known of each before a scan whose middle is at_s. loose: it may have begun to move or to change."""
@@ -219,9 +223,8 @@ class TouchTracks:
             near = [(float(np.hypot(*(self.now.tracks[f].state[PLACE] - fit.states[k, PLACE]))), f) for f in free]
             if place >= 0 or not near:
                 continue
-            away, nearest = min(near)
-            widest = max(fit.states[k, LOG_RADIUS], self.now.tracks[nearest].state[LOG_RADIUS])
-            if away < max(n.SAME_TOUCH, float(np.exp(widest))):
+            nearest = min(near)[1]
+            if _same_place(fit.states[k], self.now.tracks[nearest].state):
                 found[k] = nearest
                 free.remove(nearest)
         return tuple(found)
@@ -307,16 +310,32 @@ class TouchTracks:
         track.until_s = at_s
         return self._memory(track, at_s, 1.0)
 
+    def stay(self, fit: FoundTouches | None, kept: Sequence[int]) -> bool:
+        """Whether the tracks that a fit goes on with are where they were: one that moved away stands for another one."""
+        if fit is None:
+            return True
+        found = zip(fit.states, (self.now.tracks[place] for place in kept), strict=True)
+        return all(
+            np.hypot(*(state[PLACE] - track.state[PLACE])) < max(n.SAME_TOUCH, _radius(track)) for state, track in found
+        )
+
     def remove(self, place: int) -> None:
         """It was none."""
         del self.now.tracks[place]
 
     def _new(self, fit: FoundTouches, k: int, at_s: float) -> TrackedTouch:
         prior, state = fit.priors[k], fit.states[k]
-        track = TrackedTouch(
-            id=self.now.next_id,
-            began=self.now.watched,
-            born_s=at_s,
+        again = next((track for track in self.now.dropped if _same_place(state, track.state)), None)
+        if again is None:
+            number, began, born_s = self.now.next_id, self.now.watched, at_s
+            self.now.next_id += 1
+        else:
+            number, began, born_s = again.id, again.began, again.born_s
+            self.now.dropped = [track for track in self.now.dropped if track is not again]
+        return TrackedTouch(
+            id=number,
+            began=began,
+            born_s=born_s,
             at_s=at_s,
             state=state,
             covariance=np.eye(STATES),
@@ -329,8 +348,6 @@ class TouchTracks:
             held_at=(float(state[X]), float(state[Y]), float(state[LOG_RADIUS])),
             stayed_since_s=at_s,
         )
-        self.now.next_id += 1
-        return track
 
     def _memory(self, track: TrackedTouch, at_s: float, share: float) -> list[Memory]:
         if not track.sure or track.load <= 0:
@@ -365,6 +382,12 @@ class TouchTracks:
 def oddness(shape: Array) -> float:
     """How far an outline is from a disc's, in squared standard deviations of its prior."""
     return float((shape**2 / SHAPE_SDS**2).sum())
+
+
+def _same_place(state: Array, other: Array) -> bool:
+    """Whether a touch (7,) that was found anew is in the place of another one."""
+    widest = max(state[LOG_RADIUS], other[LOG_RADIUS])
+    return bool(np.hypot(*(state[PLACE] - other[PLACE])) < max(n.SAME_TOUCH, float(np.exp(widest))))
 
 
 def _radius(track: TrackedTouch) -> float:
