@@ -78,7 +78,7 @@ class Answering:
         if not (_strained(answer) or self._skin.touches.odd or scan.separate):
             return answer
         own = replace(question, budget=StepBudget.of(1.0, scan.separate), keeps=0.0, by_evidence=True)
-        recount = Recount(hypotheses, 0.0 if scan.separate else float(n.RECOUNT_GAIN))
+        recount = Recount(hypotheses, scan.separate)
         other = found = recount(own, answer)
         while other is not None and not own.spent:
             other = recount(own, other)

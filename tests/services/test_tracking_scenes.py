@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scipy import optimize
 
+from firmware_stub import scene as scenes
 from models.shapes import KINDS, Shape
 from services.runtime.config import Skin
+from simulation.host import SimulatedHost
 from tests.services.stub_skin import METRES, SCAN_S, StubSkin, lasting, present, transfer
 
 GATE_M = 0.015  # further away a contact is not the touch's
@@ -66,6 +68,21 @@ def switches(skin, scene, rng):
                     count += ids.get(open_[row], free[column]) != free[column]
                     ids[open_[row]] = free[column]
     return count, len(given)
+
+
+def test_a_large_tip_that_presses_slowly_in_parts_is_one_contact_all_along():
+    """Its first parts may be two touches; what was shown must not end while it is asked."""
+    host = SimulatedHost("rolling", snr_db=80.0, seed=3)
+    host.until(6.0)
+    for x, y, radius, ramp in ((-0.013, -0.02, 0.02, 0.1), (0.012, 0.018, 0.02, 0.3), (0.006, -0.013, 0.022, 0.2)):
+        start = host.now
+        press = {"t": 0.1, "x": x, "y": y, "force": 4.0, "radius": radius, "seconds": 0.8, "ramp": ramp}
+        host.play(scenes.parse({"press": [press]}))
+        host.until(start + 1.5)
+        pressed = [lasting(frame) for t, frame in host.contacts if start + 0.1 < t < start + 0.9 - ramp]
+        shown = [frame for frame in pressed if frame]
+        assert shown == pressed[-len(shown) :] and len(shown) > 50
+        assert len({contact.id for frame in shown for contact in frame}) == 1
 
 
 NO_NETWORK = Skin(port="stub", bundle="square16", frame_id="palm", network="none")

@@ -38,9 +38,9 @@ HALVED_APART = (0.6, 1.0, 1.4)  # how far each lies from its middle, in radii
 class Recount:
     """Of one skin, seen as its hypotheses see it."""
 
-    def __init__(self, hypotheses: Hypotheses, least_gain: float) -> None:
-        """least_gain: by which others must be likelier [nat]."""
-        self._least_gain = least_gain
+    def __init__(self, hypotheses: Hypotheses, separate: bool) -> None:
+        """separate: of scans that stand by themselves: evidence alone decides, and no later one is asked again."""
+        self._separate, self._least_gain = separate, 0.0 if separate else float(n.RECOUNT_GAIN)
         self._hypotheses = copy(hypotheses)
         self._hypotheses.wide = False  # what explains everything would hide how many there are
 
@@ -98,11 +98,15 @@ class Recount:
         return [other for other in both if other.fit is not None and gaps(other.fit.states).min() > 0]
 
     def _halves(self, question: Question, fit: FoundTouches, one: int) -> list[TouchPrior]:
-        """The two discs that explain most of what one does, on either side of its middle; empty where none do."""
+        """The two discs that explain most of what one does, on either side of its middle; empty where none explain
+        more than that one, and the next scans are asked too.
+        """
         white, response = question.white, self._hypotheses.response
-        others = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) for k, s in enumerate(fit.states) if k != one]
-        target = white(np.where(question.live, np.expm1(question.y) - sum(others), 0.0))
+        each = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) for s in fit.states]
+        target = white(np.where(question.live, np.expm1(question.y) - sum(each) + each[one], 0.0))
         halves, least = list[TouchPrior](), np.inf
+        if not self._separate:
+            least = float(np.linalg.norm(target - white(np.where(question.live, each[one], 0.0))))
         for places, radius in _pairs(fit.states[one]):
             both = np.stack([response(*place, radius) for place in places], axis=1)
             actions, left = nnls(white(np.where(question.live[:, None], both, 0.0)), target)
