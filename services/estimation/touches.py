@@ -311,7 +311,7 @@ class TouchTracks:
         return self._memory(track, at_s, 1.0)
 
     def stay(self, fit: FoundTouches | None, kept: Sequence[int]) -> bool:
-        """Whether the tracks that a fit goes on with are where they were: one that moved away stands for another one."""
+        """Whether the tracks that a fit goes on with are where they were: one that moved away is another one."""
         if fit is None:
             return True
         found = zip(fit.states, (self.now.tracks[place] for place in kept), strict=True)
