@@ -13,7 +13,7 @@ from models.prereconstruction import ONE_STEP_LAMBDA
 from models.symmetries import symmetries
 from protocol.frames import RawFrame
 from services.contacts.force.law import ForceLaw
-from services.estimation.first.baseline import Baseline
+from services.estimation.initialisation.baseline import Baseline
 from services.runtime.config import Skin
 from services.runtime.stage import SEPARATE
 

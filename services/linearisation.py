@@ -14,7 +14,7 @@ import numpy as np
 
 from models.bundle import Bundle
 from models.calibration_file import CalibrationFileError, found_by
-from services.estimation.first.baseline import Baseline
+from services.estimation.initialisation.baseline import Baseline
 from services.mounting import MountedSkin, MountingFit, keep, kept, needs_fit
 
 log = logging.getLogger(__name__)

@@ -25,7 +25,7 @@ from models.files import FileError, read_bytes
 from models.measurement.responses.tables import SkinTables
 from protocol.errors import in_words
 from services.estimation.by_bundle import skin_tables
-from services.estimation.first.baseline import Baseline, implausibility
+from services.estimation.initialisation.baseline import Baseline, implausibility
 from services.runtime import persistence
 from services.runtime.config import ROOT
 

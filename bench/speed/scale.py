@@ -108,14 +108,14 @@ def measured(service: Service, seconds: float, played_hz: float) -> dict[str, An
     took = time.monotonic() - began
     cores = sum(used - cpu[name] for name, used in service.cpu_s().items()) / took
     socket.close(0)
-    said_s = np.mean([(last[k]["stamps"]["publish"] - first[k]["stamps"]["publish"]) * 1e-9 for k in last])
+    sample_s = np.mean([(last[k]["stamps"]["publish"] - first[k]["stamps"]["publish"]) * 1e-9 for k in last])
     dropped = sum(sum(last[k]["drops"].values()) - sum(first[k]["drops"].values()) for k in last)
     return {
         "skins_seen": len(seen),
         "frames": len(latency),
         "p50_ms": float(np.percentile(latency or [np.inf], 50)),
         "p99_ms": float(np.percentile(latency or [np.inf], 99)),
-        "overtaken": int(dropped) / max(played_hz * float(said_s), 1.0),
+        "overtaken": int(dropped) / max(played_hz * float(sample_s), 1.0),
         "cores": cores,
         "memory_mb": sum(service.memory_bytes().values()) / 1e6,
     }

@@ -87,12 +87,12 @@ class FittedScan:
     live: int  # measurements that count
     known: KnownWhitening | None = None  # of a moment ago, as good as this covariance's own
     turned: Turned | None = None  # of a moment ago
-    said_s: float = 0.0  # for when what is found is said, from the middle of the scan on
+    sample_s: float = 0.0  # for when what is found is said, from the middle of the scan on
 
 
 @dataclass(frozen=True)
 class FoundTouches:
-    """Posterior of T touches. Action + rate * said_s is how strongly one acts at said_s, kinks included."""
+    """Posterior of T touches. Action + rate * sample_s is how strongly one acts at sample_s, kinks included."""
 
     priors: tuple[TouchPrior, ...]
     states: Array  # (T, 7)
@@ -102,7 +102,7 @@ class FoundTouches:
     chi2: float  # squared whitened residual a measurement
     evidence: float  # log
     white: Whitening
-    pulled: Array  # (K,) S^-1 of the residual
+    weighted_residual: Array  # (K,) S^-1 of the residual
     left: Array  # (K,) residual
     design: Array  # (K, N) whitened slopes of all that was solved for
     solved: Array  # (N, N) its posterior covariance
@@ -378,7 +378,7 @@ class TouchFitter:
             chi2=float(residual @ residual) / max(self._scene.live, 1),
             evidence=self._white.log_density - 0.5 * objective - occam,
             white=self._white,
-            pulled=self._white.w.T @ best,
+            weighted_residual=self._white.w.T @ best,
             left=left,
             design=point.design,
             solved=linear.solved,
@@ -392,7 +392,7 @@ class TouchFitter:
         said = np.eye(states, states + rest)
         for kinks, among in zip(self._kinks, _each(self._kinks, states + len(self._shape_mean)), strict=True):
             if kinks.bends == STRENGTH and self._priors[kinks.touch].until_s == np.inf:
-                said[STATES * kinks.touch + ACTION, among] = self._scene.course.at(kinks.profiles, self._scene.said_s)
+                said[STATES * kinks.touch + ACTION, among] = self._scene.course.at(kinks.profiles, self._scene.sample_s)
         return said
 
 

@@ -28,7 +28,7 @@ from services.contacts.force.law import ForceLaw, known_radius
 from services.contacts.placing import placement
 from services.describe import ON, geometry, symmetry
 from services.estimation.faults import checks
-from services.estimation.first.baseline import implausibility
+from services.estimation.initialisation.baseline import implausibility
 from services.runtime import room
 from services.runtime.config import RECORDINGS, ConfigError, Skin, config_path, load
 from services.runtime.stage import PROCESSES

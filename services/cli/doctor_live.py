@@ -23,7 +23,7 @@ from protocol.frames import ContactFrame, InfoFrame, RawFrame
 from protocol.runtime import CONFIG_LINK, AlreadyRunning, lock, runtime_dir
 from protocol.sockets import AllReader, ControlClient, ControlError, NewestReader
 from services.cli.judged import judgements, turned
-from services.estimation.first.baseline import TAKING
+from services.estimation.initialisation.baseline import TAKING
 from services.runtime.config import Skin
 from services.runtime.stage import HARMLESS, PROCESSES
 

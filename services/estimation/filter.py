@@ -66,7 +66,7 @@ class Prediction:
     p: Array
     columns: Array  # (K, S) of the states that are seen
     seen: NDArray[np.intp]  # (S,) their places in x
-    reach: Array  # (N, K) P H^T
+    cross_covariance: Array  # (N, K) P H^T
     shift: Array  # (K,) log |Z| over the baseline
     covariance: Array  # (K, K) of it
 
@@ -110,7 +110,7 @@ class SkinFilter:
         seen.now = then
         return seen
 
-    def ahead(self, at_s: float, flicker: Array) -> Prediction:
+    def predict(self, at_s: float, flicker: Array) -> Prediction:
         """flicker (E,): variances of the contact impedances' noise, of which a share is slow."""
         now = self.now
         passed_s = max(0.0, at_s - now.at_s)
@@ -131,12 +131,12 @@ class SkinFilter:
         columns, seen = self._columns()
         return np.asarray(columns @ x[seen] + now.remainder)
 
-    def even_variance(self, at_s: float) -> float:
+    def common_mode_variance(self, at_s: float) -> float:
         """Of what all measurements share, but for contacts."""
         p, passed_s = self.now.p, max(0.0, at_s - self.now.at_s)
         return float(p[0, 0] + 2 * passed_s * p[0, MODES] + passed_s**2 * p[MODES, MODES])
 
-    def faster(self, times: float = 1.0) -> Array:
+    def inflated_process_noise(self, times: float = 1.0) -> Array:
         """(K, K) covariance of drift faster than the filter's own; times: that variance, beyond 1 contacts move too."""
         columns = self._tables.field
         covariance = np.asarray(times * (columns * self._faster) @ columns.T)
@@ -153,24 +153,24 @@ class SkinFilter:
         contacts = np.arange(self.contacts.start, self.contacts.stop)
         p[contacts, contacts] += n.FASTER_STAYS * (times - 1) * n.CONTACT_FASTER**2
 
-    def take_in(self, predicted: Prediction, y: Array, white: Whitening) -> Array:
+    def update(self, predicted: Prediction, y: Array, white: Whitening) -> Array:
         """Learn from an untouched frame: y (K,) log |Z| over the prediction, white: of its covariance. Returns
         S^-1 y (K,).
         """
         now = self.now
         passed_s = max(0.0, predicted.at_s - now.at_s)
-        pulled = white.solve(y)
-        gathered = white(predicted.reach.T)  # (K, N)
-        now.x = predicted.x + predicted.reach @ pulled
+        weighted_residual = white.solve(y)
+        gathered = white(predicted.cross_covariance.T)  # (K, N)
+        now.x = predicted.x + predicted.cross_covariance @ weighted_residual
         now.p = predicted.p - gathered.T @ gathered
         variance = now.remainder_variance + n.REMAINDER_WALK**2 * passed_s
-        now.remainder = now.remainder + variance * pulled
+        now.remainder = now.remainder + variance * weighted_residual
         now.remainder_variance = variance * (1 - variance * white.conditional_precisions())
         now.at_s = predicted.at_s
         self._forget_the_faint()
-        return pulled
+        return weighted_residual
 
-    def take_in_beside(self, predicted: Prediction, fit: FoundTouches, grown: Array) -> None:
+    def update_beside_touches(self, predicted: Prediction, fit: FoundTouches, grown: Array) -> None:
         """Learn from a touched frame what its touches, which may be any near those that were found, leave open. grown
         (K,): times what the skin changes by, as the fit's values show it.
 
@@ -179,15 +179,15 @@ class SkinFilter:
         """
         now, white = self.now, fit.white
         passed_s = max(0.0, predicted.at_s - now.at_s)
-        reach = predicted.reach * grown
+        reach = predicted.cross_covariance * grown
         gathered = white(reach.T)  # (K, N)
         beside = fit.design.T @ gathered
-        now.x = predicted.x + reach @ fit.pulled
+        now.x = predicted.x + reach @ fit.weighted_residual
         now.p = predicted.p - gathered.T @ gathered + beside.T @ (fit.solved @ beside)
         told = fit.design.T @ white.w
         precision = white.conditional_precisions() - np.sum(told * (fit.solved @ told), axis=0)
         variance = now.remainder_variance + n.REMAINDER_WALK**2 * passed_s
-        now.remainder = now.remainder + variance * grown * fit.pulled
+        now.remainder = now.remainder + variance * grown * fit.weighted_residual
         now.remainder_variance = variance * (1 - variance * grown**2 * np.maximum(precision, 0.0))
         now.at_s = predicted.at_s
 
@@ -200,9 +200,9 @@ class SkinFilter:
         columns = np.array([share * memory.column for share, memory in zip(most, memories, strict=True)]).T
         return np.asarray(columns @ columns.T)
 
-    def may_remember(self, pulled: Array) -> bool:
-        """Whether foam may remember as much as a residual says; pulled (K,): S^-1 of it, S with `more_memory`. What one
-        place remembers of several touches is no more than it may of the strongest.
+    def may_remember(self, weighted_residual: Array) -> bool:
+        """Whether foam may remember as much as a residual says; weighted_residual (K,): S^-1 of it, S with
+        `more_memory`. What one place remembers of several touches is no more than it may of the strongest.
         """
         memories = self.now.memories
         if not memories:
@@ -211,7 +211,7 @@ class SkinFilter:
         states = self.now.x[self._fixed :].reshape(len(memories), STATES_OF_MEMORY)
         own = [self._own(place) for place in range(len(memories))]
         variance = np.array([float(self.now.p[each, each].sum()) for each in own]) + most**2
-        share = states.sum(axis=1) + variance * (np.array([memory.column for memory in memories]) @ pulled)
+        share = states.sum(axis=1) + variance * (np.array([memory.column for memory in memories]) @ weighted_residual)
         return all(
             sum(share[k] for k in places) <= max(most[k] for k in places)
             for places in ([k for k, m in enumerate(memories) if m.at_place_of(memory)] for memory in memories)
@@ -246,15 +246,15 @@ class SkinFilter:
         now.p = p
         now.memories.append(memory)
 
-    def beyond_memory(self, predicted: Prediction, pulled: Array, white: Whitening) -> Memory | None:
-        """The memory that would have to be more than any foam's; pulled (K,): S^-1 y."""
+    def beyond_memory(self, predicted: Prediction, weighted_residual: Array, white: Whitening) -> Memory | None:
+        """The memory that would have to be more than any foam's; weighted_residual (K,): S^-1 y."""
         for place, memory in enumerate(self.now.memories):
             age_s = predicted.at_s - memory.at_s
             if age_s > n.MEMORY_DOUBT_S or memory.mixed:
                 continue
             own = self._own(place)
-            reach = predicted.reach[own].sum(axis=0)
-            left = float(predicted.x[own].sum() + reach @ pulled)
+            reach = predicted.cross_covariance[own].sum(axis=0)
+            left = float(predicted.x[own].sum() + reach @ weighted_residual)
             whitened = white(reach)
             variance = float(predicted.p[own, own].sum() - whitened @ whitened)
             most = n.MEMORY_MOST * memory.action * self._faded(memory, predicted.at_s)

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass
-class KnownCourse:
+class TrackMotion:
     """What scans that share no value told of one touch, the last at `at_s`."""
 
     at_s: float
@@ -33,7 +33,7 @@ class KnownCourse:
     apart_s: float = -np.inf  # when it last stood apart from all others
 
     @classmethod
-    def begun(cls, state: Array, sd: Array, at_s: float) -> KnownCourse:
+    def begun(cls, state: Array, sd: Array, at_s: float) -> TrackMotion:
         """Of its first scan."""
         return cls(at_s, float(state[X]), float(state[Y]), _place_sd(sd), float(state[ACTION]), float(sd[ACTION]))
 

@@ -13,18 +13,18 @@ from models.measurement.covariance.lines import LineState
 from models.measurement.covariance.noise import NoiseModel, NoiseState
 from models.measurement.covariance.whitening import leave_out
 from models.measurement.responses.tables import SkinTables
-from services.estimation.asked.hypotheses import Hypotheses
-from services.estimation.faults.asking import FaultAsking
+from services.estimation.delayed_update import DelayedUpdate, LearningState
 from services.estimation.faults.board import BoardFaults, FaultState
+from services.estimation.faults.isolation import FaultIsolation
 from services.estimation.faults.table import any_touches
 from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, Memory, SkinFilter
-from services.estimation.first.start import EarlierBaseline
-from services.estimation.first.tare import AgreedScans
-from services.estimation.learning import Learning, LearningState
-from services.estimation.looks.quick import QuickLook
-from services.estimation.looks.slow import SlowLook, SlowState
-from services.estimation.refused import RefusedChange, RefusedState
+from services.estimation.gates.null_gate import NullGate
+from services.estimation.gates.slow_onset import SlowOnsetTest, SlowState
+from services.estimation.hypotheses.hypotheses import Hypotheses
+from services.estimation.initialisation.start import EarlierBaseline
+from services.estimation.initialisation.tare import AgreedScans
 from services.estimation.touches import TouchesState, TouchTracks
+from services.estimation.unexplained_load import RefusedState, UnexplainedLoad
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ class KnownBaseline(NamedTuple):
         """For the first scans, when nobody knows how far the skin has drifted; tables: of its bundle."""
         drift = SkinFilter(tables.relative_to(np.exp(self.log_z0)))
         drift.begin(0.0, np.full(tables.electrodes, n.START_CONTACT**2))
-        covariance = drift.ahead(float(n.OLDEST_S), np.zeros(tables.electrodes)).covariance
+        covariance = drift.predict(float(n.OLDEST_S), np.zeros(tables.electrodes)).covariance
         covariance[np.diag_indices_from(covariance)] += self.scatter**2 / self.frames
         leave_out(covariance, self.live)
         return EarlierBaseline(self.log_z0, covariance)
@@ -62,7 +62,7 @@ class TaredState:
     faults: FaultState
     refused: RefusedState
     slow: SlowState
-    adrift: float
+    process_noise_scale: float
     wide: bool
     aged: list[FilterState]  # of a baseline that was adopted, by how old it may be; empty after the first scan
 
@@ -77,13 +77,13 @@ class TaredSkin:
         self.noise, self.drift = NoiseModel(self.tables), SkinFilter(self.tables)
         self.touches = TouchTracks(self.tables.response)
         self.hypotheses = Hypotheses(self.tables, self.noise, self.drift)
-        self.learning = Learning(self.drift, self.noise)
-        self.slow = SlowLook(self.drift)
-        self.refused = RefusedChange(tables.measurements)
-        self.quick = QuickLook(self.hypotheses.grid)
+        self.learning = DelayedUpdate(self.drift, self.noise)
+        self.slow_onset = SlowOnsetTest(self.drift)
+        self.refused = UnexplainedLoad(tables.measurements)
+        self.null_gate = NullGate(self.hypotheses.grid)
         self.aged = list[FilterState]()
         self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
-        self.asking = FaultAsking(self.tables, self.noise, self.touches, self.hypotheses, self.faults)
+        self.isolation = FaultIsolation(self.tables, self.noise, self.touches, self.hypotheses, self.faults)
 
     def begin(self, scans: AgreedScans, next_id: int) -> None:
         """scans: those of the baseline."""
@@ -116,7 +116,10 @@ class TaredSkin:
         made.noise.now, made.noise.lines.now = self.noise.now, self.noise.lines.now
         made.touches.now, made.learning.now = self.touches.now, self.learning.now
         made.faults.now = self.faults.now
-        made.hypotheses.adrift, made.hypotheses.wide = self.hypotheses.adrift, self.hypotheses.wide
+        made.hypotheses.process_noise_scale, made.hypotheses.wide = (
+            self.hypotheses.process_noise_scale,
+            self.hypotheses.wide,
+        )
         made.drift.succeed(self.drift)
         return made
 
@@ -125,15 +128,15 @@ class TaredSkin:
         for memory in memories:
             self.drift.remember(memory)
         if memories:
-            self.forget_looks()
+            self.forget_gates()
 
-    def forget_looks(self) -> None:
+    def forget_gates(self) -> None:
         """The untouched skin is another than at the last scans."""
-        self.quick.forget()
+        self.null_gate.forget()
 
     def state(self) -> TaredState:
         """What a whitening of a moment ago told is forgotten: who goes on from this state does not have it."""
-        self.forget_looks()
+        self.forget_gates()
         return TaredState(
             baseline=self.baseline,
             noise=self.noise.now,
@@ -143,8 +146,8 @@ class TaredSkin:
             learning=self.learning.now,
             faults=self.faults.now,
             refused=self.refused.now,
-            slow=self.slow.now,
-            adrift=self.hypotheses.adrift,
+            slow=self.slow_onset.now,
+            process_noise_scale=self.hypotheses.process_noise_scale,
             wide=self.hypotheses.wide,
             aged=self.aged,
         )
@@ -160,5 +163,9 @@ class TaredSkin:
         self.noise.now, self.noise.lines.now = state.noise, state.lines
         self.drift.now, self.touches.now = state.drift, state.touches
         self.learning.now, self.faults.now, self.refused.now = state.learning, state.faults, state.refused
-        self.slow.now = state.slow
-        self.hypotheses.adrift, self.hypotheses.wide, self.aged = state.adrift, state.wide, state.aged
+        self.slow_onset.now = state.slow
+        self.hypotheses.process_noise_scale, self.hypotheses.wide, self.aged = (
+            state.process_noise_scale,
+            state.wide,
+            state.aged,
+        )

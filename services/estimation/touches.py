@@ -35,9 +35,9 @@ from models.measurement.touch import (
     is_plain,
     within_limits,
 )
-from services.estimation.asked.looked_at import LookedAt
 from services.estimation.filter import Memory
-from services.estimation.overlap import KnownCourse, gaps
+from services.estimation.hypotheses.observation import Observation
+from services.estimation.overlap import TrackMotion, gaps
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import TouchEstimate
 
@@ -50,7 +50,7 @@ class TrackedTouch:
 
     id: int
     began: bool
-    born_s: float
+    created_s: float
     at_s: float
     state: Annotated[Array, "states"]
     covariance: Annotated[Array, "states", "states"]
@@ -58,9 +58,9 @@ class TrackedTouch:
     log_radius_sd: float
     shape: Annotated[Array, "shapes"]
     shape_variance: Annotated[Array, "shapes"]
-    course: KnownCourse  # as known from scans that share no value
-    stays_at: tuple[float, float, float] = (0.0, 0.0, np.inf)  # x, y while it stays, so known, and their sd
-    stays_for: int = 0  # scans that are in it
+    course: TrackMotion  # as known from scans that share no value
+    steady_position: tuple[float, float, float] = (0.0, 0.0, np.inf)  # x, y while it stays, so known, and their sd
+    steady_for: int = 0  # scans that are in it
     since_s: float = -np.inf  # it acts from then on
     until_s: float = np.inf  # it acted until then: it has ended, and the window still holds values of before
     at_once: bool = False  # so it ended
@@ -69,8 +69,8 @@ class TrackedTouch:
     still: int = 0  # of them, in a row: it neither moved nor changed
     moves: bool = False
     z2: float = 0.0  # how much it explains: squared sigmas of its action, in the middle of the scan or at its end
-    sure: bool = False
-    told: bool = False  # several scans told it from a changed contact impedance
+    confirmed: bool = False
+    told_from_contact: bool = False  # several scans told it from a changed contact impedance
     lost: bool = False  # scans were lost since: it may be anywhere
     peak: float = 0.0  # action that it surely had
     held: float = 0.0  # action before it began to go
@@ -132,7 +132,9 @@ class TouchTracks:
     def steady(self) -> bool:
         """Whether there are touches, and all stay as they are."""
         tracks = self.now.tracks
-        return bool(tracks) and all(t.sure and t.still >= n.STILL_SCANS and not (t.ended or t.lost) for t in tracks)
+        return bool(tracks) and all(
+            t.confirmed and t.still >= n.STILL_SCANS and not (t.ended or t.lost) for t in tracks
+        )
 
     @property
     def lost(self) -> bool:
@@ -157,12 +159,12 @@ class TouchTracks:
                 track.asked_odd, found = odd, True
         return found
 
-    def correct(self, fit: FoundTouches, kept: Sequence[int]) -> None:
+    def correct(self, fit: FoundTouches, association: Sequence[int]) -> None:
         """Tracks stood for several touches, or for parts of one: they were never where they were held."""
         for place, track in enumerate(self.now.tracks):
             track.held = track.load = 0.0
-            if place in kept:
-                state = fit.states[kept.index(place)]
+            if place in association:
+                state = fit.states[association.index(place)]
                 track.held = track.load = track.peak = float(state[ACTION])
                 track.held_at = (float(state[X]), float(state[Y]), float(state[LOG_RADIUS]))
 
@@ -172,13 +174,13 @@ class TouchTracks:
         for track in self.now.tracks:
             track.lost, track.still = True, 0
 
-    def drop_the_vague(self, in_question: Callable[[Array], bool]) -> list[TrackedTouch]:
+    def drop_tentative(self, in_question: Callable[[Array], bool]) -> list[TrackedTouch]:
         """Forget what one part of a scan made of a touch that begins, and is not sure: the next one looks anew.
         in_question: whether a touch of that state may as well be a contact impedance. Returns those.
         """
         tracks = self.now.tracks
-        self.now.tracks = [t for t in tracks if t.sure or (t.scans and not in_question(t.state))]
-        vague = [t for t in tracks if all(t is not kept for kept in self.now.tracks)]
+        self.now.tracks = [t for t in tracks if t.confirmed or (t.scans and not in_question(t.state))]
+        vague = [t for t in tracks if all(t is not other for other in self.now.tracks)]
         self.now.dropped += vague
         return vague
 
@@ -188,7 +190,7 @@ class TouchTracks:
         self.now.tracks, self.now.dropped = [], []
         return memories
 
-    def drop_the_past(self, oldest_s: float) -> None:
+    def drop_ended(self, oldest_s: float) -> None:
         """Forget what ended before the oldest value that a window holds, or was dropped and not found again."""
         self.now.tracks = [track for track in self.now.tracks if track.until_s > oldest_s - SUDDEN_REACH_S]
         self.now.dropped = [track for track in self.now.dropped if track.at_s > oldest_s - n.CHANGING_S]
@@ -213,13 +215,13 @@ class TouchTracks:
         reach = gaps([tracks[k].state for k in lasting]).min(axis=1)
         return [k for k, gap in zip(lasting, reach, strict=True) if gap < _radius(tracks[k])]
 
-    def recognised(self, fit: FoundTouches, kept: Sequence[int]) -> tuple[int, ...]:
-        """kept, where touches that were found anew are those that were there before in the same places: also a part of
-        one that is several by now.
+    def associated(self, fit: FoundTouches, association: Sequence[int]) -> tuple[int, ...]:
+        """association, where touches that were found anew are those that were there before in the same places: also a
+        part of one that is several by now.
         """
-        free = [k for k, track in enumerate(self.now.tracks) if k not in kept and not track.ended]
-        found = list(kept)
-        for k, place in enumerate(kept):
+        free = [k for k, track in enumerate(self.now.tracks) if k not in association and not track.ended]
+        found = list(association)
+        for k, place in enumerate(association):
             near = [(float(np.hypot(*(self.now.tracks[f].state[PLACE] - fit.states[k, PLACE]))), f) for f in free]
             if place >= 0 or not near:
                 continue
@@ -229,13 +231,17 @@ class TouchTracks:
                 free.remove(nearest)
         return tuple(found)
 
-    def settle(self, fit: FoundTouches, kept: Sequence[int], measured: LookedAt, explained: bool) -> list[Memory]:
-        """Take over a fit. kept: of each of its touches the track that it continues; -1: it is new. explained: by the
-        fit; else it is only roughly right. Returns what touches that ended or moved away leave in the foam.
+    def update(
+        self, fit: FoundTouches, association: Sequence[int], measured: Observation, explained: bool
+    ) -> list[Memory]:
+        """Take over a fit. association: of each of its touches the track that it continues; -1: it is new. explained:
+        by the fit; else it is only roughly right. Returns what touches that ended or moved away leave in the foam.
         """
         at_s, span_s, whole = measured.middle_s, measured.span_s, measured.whole
         before = self.now.tracks
-        self.now.tracks = [before[place] if place >= 0 else self._new(fit, k, at_s) for k, place in enumerate(kept)]
+        self.now.tracks = [
+            before[place] if place >= 0 else self._new(fit, k, at_s) for k, place in enumerate(association)
+        ]
         memories, meeting = list[Memory](), self.meeting(at_s)
         for k, track in enumerate(self.now.tracks):
             own = slice(STATES * k, STATES * (k + 1))
@@ -246,16 +252,16 @@ class TouchTracks:
             if explained:
                 memories += self._held(track, at_s, span_s, whole)
             memories += self._ending(k, fit.priors[k], at_s, span_s)
-        if -1 in kept:
-            self._divide(kept, fit.priors[kept.index(-1)])
-        self.now.tracks = [track for track in self.now.tracks if track.sure or not track.ended]
+        if -1 in association:
+            self._divide(association, fit.priors[association.index(-1)])
+        self.now.tracks = [track for track in self.now.tracks if track.confirmed or not track.ended]
         if whole and explained:
             self._follow(at_s)
         return memories
 
     def _take_prior(self, track: TrackedTouch, prior: TouchPrior, at_s: float) -> None:
         """When it began, changed and ended, and whether it is the one that it was, as a fit around at_s took it."""
-        if track.sure and is_anywhere(prior):  # found anew: it may be another one, or none
+        if track.confirmed and is_anywhere(prior):  # found anew: it may be another one, or none
             track.scans = 0
         track.since_s, track.turned_s = at_s + prior.since_s, at_s + prior.turns_s
         if not track.ended:
@@ -277,11 +283,11 @@ class TouchTracks:
         track.at_once = track.turned_s < np.inf or -track.state[RATE] * span_s > n.GOES * track.held
         return self.released(place, at_s + span_s / 2)
 
-    def _divide(self, kept: Sequence[int], free: TouchPrior) -> None:
+    def _divide(self, association: Sequence[int], free: TouchPrior) -> None:
         """Those that have just come were taken for what now are two: of their radius and outline nothing is known but
         what any touch has, as a new one, `free`, has it.
         """
-        for track, place in zip(self.now.tracks, kept, strict=True):
+        for track, place in zip(self.now.tracks, association, strict=True):
             if place >= 0 and track.scans <= n.SURE_SCANS:
                 track.log_radius, track.log_radius_sd = float(free.mean[LOG_RADIUS]), float(free.sd[LOG_RADIUS])
                 track.shape, track.shape_variance = np.zeros(len(SHAPE_SDS)), SHAPE_SDS**2
@@ -292,13 +298,13 @@ class TouchTracks:
             return
         for track, gap in zip(tracks, gaps([track.state for track in tracks]).min(axis=1), strict=True):
             track.course.follow(track.state, np.sqrt(np.maximum(np.diag(track.covariance), 0.0)), at_s)
-            if gap > _radius(track) and track.sure and track.scans >= n.SURE_SCANS:  # by what it shows alone
+            if gap > _radius(track) and track.confirmed and track.scans >= n.SURE_SCANS:  # by what it shows alone
                 track.course.apart_s = at_s
 
     def tell(self, fit: FoundTouches, at_s: float, span_s: float) -> None:
         """What was taken for a changed contact impedance is this touch."""
         track = self._new(fit, 0, at_s)
-        track.told = track.sure = True
+        track.told_from_contact = track.confirmed = True
         _update(track, fit.states[0], fit.covariance[:STATES, :STATES], at_s, span_s, whole=True)
         self.now.tracks.append(track)
 
@@ -310,11 +316,11 @@ class TouchTracks:
         track.until_s = at_s
         return self._memory(track, at_s, 1.0)
 
-    def stay(self, fit: FoundTouches | None, kept: Sequence[int]) -> bool:
+    def stay(self, fit: FoundTouches | None, association: Sequence[int]) -> bool:
         """Whether the tracks that a fit goes on with are where they were: one that moved away is another one."""
         if fit is None:
             return True
-        found = zip(fit.states, (self.now.tracks[place] for place in kept), strict=True)
+        found = zip(fit.states, (self.now.tracks[place] for place in association), strict=True)
         return all(
             np.hypot(*(state[PLACE] - track.state[PLACE])) < max(n.SAME_TOUCH, _radius(track)) for state, track in found
         )
@@ -327,15 +333,15 @@ class TouchTracks:
         prior, state = fit.priors[k], fit.states[k]
         again = next((track for track in self.now.dropped if _same_place(state, track.state)), None)
         if again is None:
-            number, began, born_s = self.now.next_id, self.now.watched, at_s
+            number, began, created_s = self.now.next_id, self.now.watched, at_s
             self.now.next_id += 1
         else:
-            number, began, born_s = again.id, again.began, again.born_s
+            number, began, created_s = again.id, again.began, again.created_s
             self.now.dropped = [track for track in self.now.dropped if track is not again]
         return TrackedTouch(
             id=number,
             began=began,
-            born_s=born_s,
+            created_s=created_s,
             at_s=at_s,
             state=state,
             covariance=np.eye(STATES),
@@ -343,14 +349,14 @@ class TouchTracks:
             log_radius_sd=float(prior.sd[LOG_RADIUS]),
             shape=np.zeros(len(SHAPE_SDS)),
             shape_variance=SHAPE_SDS**2,
-            course=KnownCourse.begun(state, np.sqrt(np.diag(fit.covariance)[STATES * k : STATES * (k + 1)]), at_s),
+            course=TrackMotion.begun(state, np.sqrt(np.diag(fit.covariance)[STATES * k : STATES * (k + 1)]), at_s),
             since_s=at_s + prior.since_s,
             held_at=(float(state[X]), float(state[Y]), float(state[LOG_RADIUS])),
             stayed_since_s=at_s,
         )
 
     def _memory(self, track: TrackedTouch, at_s: float, share: float) -> list[Memory]:
-        if not track.sure or track.load <= 0:
+        if not track.confirmed or track.load <= 0:
             return []
         x, y, log_radius = track.held_at
         return [Memory(self._response(x, y, log_radius), share * track.load, at_s, x, y, log_radius)]
@@ -459,20 +465,20 @@ def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, s
 
 def _follow_place(track: TrackedTouch) -> None:
     """One that stays is where all its scans say, weighed as they are sure of it."""
-    (x, y), sd, known = track.state[PLACE], track.place_sd, np.hypot(track.stays_at[2], n.PLACE_WALK)
+    (x, y), sd, known = track.state[PLACE], track.place_sd, np.hypot(track.steady_position[2], n.PLACE_WALK)
     if not _stays(track):
-        track.stays_at, track.stays_for = (float(x), float(y), sd), 0
+        track.steady_position, track.steady_for = (float(x), float(y), sd), 0
         return
-    track.stays_for += 1
+    track.steady_for += 1
     share = known**2 / (known**2 + sd**2)
-    (then_x, then_y), left = track.stays_at[:2], float(np.sqrt(share) * sd)
-    track.stays_at = float(then_x + share * (x - then_x)), float(then_y + share * (y - then_y)), left
+    (then_x, then_y), left = track.steady_position[:2], float(np.sqrt(share) * sd)
+    track.steady_position = float(then_x + share * (x - then_x)), float(then_y + share * (y - then_y)), left
 
 
 def _stays(track: TrackedTouch) -> bool:
     """Whether the last scan has it where it stayed."""
-    off = float(np.hypot(*(track.state[PLACE] - track.stays_at[:2])))
-    known = np.hypot(track.stays_at[2], n.PLACE_WALK)
+    off = float(np.hypot(*(track.state[PLACE] - track.steady_position[:2])))
+    known = np.hypot(track.steady_position[2], n.PLACE_WALK)
     return bool(track.still >= n.STILL_SCANS and off < n.STAYS_WITHIN * np.hypot(known, track.place_sd))
 
 
@@ -522,12 +528,12 @@ def estimate_of(track: TrackedTouch, sample_s: float, span_s: float, unexplained
     to_said[0, X] = to_said[1, Y] = to_said[2, LOG_RADIUS] = 1.0
     to_said[3, ACTION], to_said[3, LOG_RADIUS] = by_action, -2 * drop / (1 + strength / 2)
     said, place = to_said @ covariance @ to_said.T, state[PLACE]
-    if track.stays_for >= n.STILL_SCANS and _stays(track):
-        place = np.array(track.stays_at[:2])  # as sure as by one scan: what all of them get wrong is not known
+    if track.steady_for >= n.STILL_SCANS and _stays(track):
+        place = np.array(track.steady_position[:2])  # as sure as by one scan: what all of them get wrong is not known
     return TouchEstimate(
         id=track.id,
         began=track.began,
-        age_s=sample_s - track.born_s,
+        age_s=sample_s - track.created_s,
         x=float(place[0]),
         y=float(place[1]),
         vx=0.0 if track.still >= n.STILL_SCANS else float(state[VELOCITY][0]),
@@ -542,7 +548,7 @@ def estimate_of(track: TrackedTouch, sample_s: float, span_s: float, unexplained
     )
 
 
-def roughly(touch: TouchEstimate, passed_s: float) -> TouchEstimate:
+def coasted(touch: TouchEstimate, passed_s: float) -> TouchEstimate:
     """One that a scan changed so that nothing explains it: that it is there, where roughly, and not how strongly.
     passed_s: since it was said last.
     """

@@ -13,7 +13,7 @@ from models.bundle import Bundle, BundleError
 from models.calibration_file import found_by
 from models.prereconstruction import PreReconstructor, noise_of_frames
 from protocol.frames import RawFrame
-from services.estimation.first.baseline import Baseline, NoBaseline, take
+from services.estimation.initialisation.baseline import Baseline, NoBaseline, take
 from services.estimation.values import numbers
 from services.estimation.values.judgement import Judgement, Verdict
 from services.mounting import MountingFit, needs_fit

@@ -24,7 +24,7 @@ from services.cli.doctor import _key, electrode_order
 from services.cli.doctor_live import Finding, validity
 from services.cli.doctor_mounting import mounting_found
 from services.cli.judged import turned
-from services.estimation.first.baseline import TAKING
+from services.estimation.initialisation.baseline import TAKING
 from services.estimation.values.judgement import judge
 from services.judged import judged
 from services.runtime.config import Skin

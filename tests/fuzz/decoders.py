@@ -34,7 +34,7 @@ from protocol.topics import TOPICS
 from services.calibration import presses_csv as calibration_csv
 from services.calibration.force_fit import CalibrationError
 from services.contacts.force import calibration_file as calibration
-from services.estimation.first.baseline import Baseline
+from services.estimation.initialisation.baseline import Baseline
 from services.preprocessing import Preprocessing
 from services.recordings import settings
 from services.recordings.recording import RecordingError, RecordingReader, RecordingWriter

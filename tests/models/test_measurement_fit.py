@@ -165,7 +165,7 @@ def test_a_fit_that_is_linear_has_the_posterior_and_the_evidence_of_linear_algeb
     left = off - design @ best
     assert found.chi2 == pytest.approx(left @ inverse @ left / 120, rel=0.01)
     assert_allclose(found.left, left, atol=3e-6)
-    assert_allclose(found.pulled, inverse @ left, atol=0.02 * np.abs(inverse @ left).max())
+    assert_allclose(found.weighted_residual, inverse @ left, atol=0.02 * np.abs(inverse @ left).max())
     other = Hills()(-0.3, 0.4, -1.5)
     without = inverse - inverse @ design @ posterior @ design.T @ inverse
     assert found.information(other) == pytest.approx(other @ without @ other, rel=0.02)
@@ -193,10 +193,10 @@ def test_a_touchs_misfit_and_values_that_do_not_count_make_it_less_sure() -> Non
 def test_what_is_said_of_a_touch_that_changed_at_once_is_how_strongly_it_acts_then() -> None:
     course, strength = TouchCourse(Hills(), TIMES_S, SPAN_S), np.where(TIMES_S < 0, 0.02, 0.03)
     y, prior = np.log1p(strength * Hills()(0.2, -0.1, np.log(0.18))), plain(anywhere(0.2, -0.1, 0.02, SPAN_S))
-    for said_s, acts in ((-0.015, 0.02), (0.015, 0.03)):
-        scan = FittedScan(y, 1e-10 * np.eye(120), course, np.eye(120) / 120, 120, said_s=said_s)
+    for sample_s, acts in ((-0.015, 0.02), (0.015, 0.03)):
+        scan = FittedScan(y, 1e-10 * np.eye(120), course, np.eye(120) / 120, 120, sample_s=sample_s)
         state = TouchFitter(scan, [replace(prior, turns_s=0.0)], 0.0).fit(20).states[0]
-        assert state[ACTION] + state[RATE] * said_s == pytest.approx(acts, rel=0.05)
+        assert state[ACTION] + state[RATE] * sample_s == pytest.approx(acts, rel=0.05)
         assert state[PLACE] == pytest.approx([0.2, -0.1], abs=0.02)
 
 

@@ -15,7 +15,7 @@ from protocol.frames import Contact
 from services.contacts.force.curve import Curve
 from services.contacts.force.law import ForceLaw, Look
 from services.contacts.force.of_disc import SATURATED
-from services.estimation.first.baseline import take
+from services.estimation.initialisation.baseline import take
 from services.pipeline import Pipeline
 from services.runtime.config import ConfigError, Skin
 from tests.services.stub_skin import METRES, present, whole_scan

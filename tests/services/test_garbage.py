@@ -9,7 +9,7 @@ from models.bundle import Bundle
 from models.forward import shared
 from models.shapes import Shape
 from protocol.frames import STATUS_OPEN, pack, unpack
-from services.estimation.first.baseline import Baseline, NoBaseline, take
+from services.estimation.initialisation.baseline import Baseline, NoBaseline, take
 from services.pipeline import Pipeline
 from services.runtime.config import Skin
 from simulation.host import LATE_S, SimulatedHost

@@ -7,7 +7,7 @@ from models.shapes import Shape, drop_image
 from protocol.frame_types import REASONS, VERDICTS
 from protocol.frames import STATUS_OPEN, DeltaFrame, JudgementsFrame, PartFrame, RawFrame, pack, unpack
 from services.estimation.images.quality import Residual
-from services.estimation.touches import roughly
+from services.estimation.touches import coasted
 from services.estimation.values.estimate import TouchEstimate
 from services.estimation.values.judgement import ROWS, Verdict, judge, reasons, valid
 from services.estimation.values.scan import Scan
@@ -235,7 +235,7 @@ def test_the_ellipse_of_a_place_points_as_its_covariance_says_and_one_not_explai
     touch = TouchEstimate(1, True, 1.0, 0.1, -0.2, 0.0, 0.0, -2.3, 0.3, covariance, 9.0, 0.1, 0.01, 0.0)
     *axes, angle = on_the_wire(touch, 0.05).sigma
     assert [*axes, angle % np.pi] == pytest.approx([0.005, 0.001, 0.6], rel=0.05)
-    more = roughly(touch, 0.045).covariance - covariance
+    more = coasted(touch, 0.045).covariance - covariance
     assert 0 < more[0, 0] == pytest.approx(more[1, 1]) and np.count_nonzero(more) == 2
 
 

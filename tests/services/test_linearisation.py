@@ -12,7 +12,7 @@ from models.calibration_file import CalibrationFileError, found_by, pack, unpack
 from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
 from services import mounting
-from services.estimation.first.baseline import Baseline
+from services.estimation.initialisation.baseline import Baseline
 from services.pipeline import Pipeline
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin, TareConfig

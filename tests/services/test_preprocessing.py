@@ -15,9 +15,9 @@ from models.shapes import Shape
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA, JudgementsFrame, RawFrame, pack, unpack
 from services.describe import EVERY_S, MOVED
 from services.estimation.faults import checks
-from services.estimation.first.baseline import Baseline, NoBaseline, agreement, take
-from services.estimation.first.start import JudgedStart, StartJudge, StartSays
-from services.estimation.first.tare import without_drift
+from services.estimation.initialisation.baseline import Baseline, NoBaseline, agreement, take
+from services.estimation.initialisation.start import JudgedStart, StartSays, TouchAtStartTest
+from services.estimation.initialisation.tare import without_drift
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin, TareConfig
 from services.runtime.stage import Refused
@@ -407,7 +407,7 @@ def solved(*shapes: Shape, background: float = 1.0, contact: Array | float = 1.0
 def judged(z: Array, rng: np.random.Generator) -> JudgedStart:
     sigma = NOISE / np.sqrt(SCANS)
     mean = np.log(z) + sigma * rng.standard_normal(len(z))
-    judge = StartJudge(tables_of(Bundle.load("square16")))
+    judge = TouchAtStartTest(tables_of(Bundle.load("square16")))
     return judge(mean, np.full(len(z), sigma**2), np.ones(len(z), bool), None)
 
 

@@ -63,12 +63,12 @@ class NoiseModel:
         self.now.white = max(float(np.median(steps**2)) / 2 / MEDIAN_OF_SQUARES, float(RESPONSE_FLOOR**2))
         for n in range(ROUNDS):
             white = Whitening.of(self.covariance(part))
-            pulled = white.solve(residuals.T).T  # (n, K) S^-1 e
-            self._follow_contacts(pulled, white, 1 / 2)
-            energy = float(np.median(pulled**2 / white.conditional_precisions())) / MEDIAN_OF_SQUARES
+            weighted_residual = white.solve(residuals.T).T  # (n, K) S^-1 e
+            self._follow_contacts(weighted_residual, white, 1 / 2)
+            energy = float(np.median(weighted_residual**2 / white.conditional_precisions())) / MEDIAN_OF_SQUARES
             self.now.white *= min(max(energy, 0.5), 2.0)
             if n >= ROUNDS // 2:
-                self.lines.hear_anew(self._left(pulled[alike], part), part, self.now.white)
+                self.lines.hear_anew(self._left(weighted_residual[alike], part), part, self.now.white)
 
     def variances(self) -> Array:
         """(K,) of what is independent from measurement to measurement."""
@@ -90,47 +90,47 @@ class NoiseModel:
         made[np.diag_indices_from(made)] += self.variances()
         return made
 
-    def learn(self, pulled: Array, white: Whitening) -> None:
-        """Follow the noise of one untouched frame that was explained: pulled = S^-1 y (K,)."""
-        self._follow_contacts(pulled[None], white, LEARNING)
-        excess = self._excess(pulled, white.conditional_precisions())
+    def learn(self, weighted_residual: Array, white: Whitening) -> None:
+        """Follow the noise of one untouched frame that was explained: weighted_residual = S^-1 y (K,)."""
+        self._follow_contacts(weighted_residual[None], white, LEARNING)
+        excess = self._excess(weighted_residual, white.conditional_precisions())
         steady = self._squares @ self.now.jitter < 0.2 * self.now.white
         if steady.sum() >= STEADY_CONTACTS:
             change = LEARNING_WHITE * float(excess[steady].mean())
             self.now.white = float(np.clip(self.now.white + change, 0.8 * self.now.white, 1.25 * self.now.white))
 
-    def learn_contacts(self, pulled: Array, white: Whitening) -> None:
+    def learn_contacts(self, weighted_residual: Array, white: Whitening) -> None:
         """Follow the contacts' noise alone, as far as a touch that is there leaves it to be seen."""
-        self._follow_contacts(pulled[None], white, LEARNING)
+        self._follow_contacts(weighted_residual[None], white, LEARNING)
 
-    def hear(self, pulled: Array, part: int, odd: bool, at_s: float, span_s: float) -> None:
-        """Take note of what several measurements of a frame have in common beside drift and contacts: pulled (K,) is
-        S^-1 of its residual. odd: more than was known.
+    def hear(self, weighted_residual: Array, part: int, odd: bool, at_s: float, span_s: float) -> None:
+        """Take note of what several measurements of a frame have in common beside drift and contacts: weighted_residual
+        (K,) is S^-1 of its residual. odd: more than was known.
         """
-        if self.lines.hear(self._left(pulled, part), part, odd, at_s, span_s):
+        if self.lines.hear(self._left(weighted_residual, part), part, odd, at_s, span_s):
             self.lines.now.make(self.now.white)
 
-    def _left(self, pulled: Array, part: int) -> Array:
+    def _left(self, weighted_residual: Array, part: int) -> Array:
         """(..., K) the likeliest white noise and disturbance, of S^-1 y."""
         columns = self.disturbing(part)
-        return np.asarray(self.variances() * pulled + (pulled @ columns) @ columns.T)
+        return np.asarray(self.variances() * weighted_residual + (weighted_residual @ columns) @ columns.T)
 
-    def _follow_contacts(self, pulled: Array, white: Whitening, share: float) -> None:
+    def _follow_contacts(self, weighted_residual: Array, white: Whitening, share: float) -> None:
         """Unbiased moments: the generalised least squares estimate of a contact's change has variance v + 1 / n, with
         n its information.
         """
         columns = white(self._contact)
         information = np.maximum((columns**2).sum(axis=0), 1e-12)
-        moved = (pulled @ self._contact / information) ** 2
+        moved = (weighted_residual @ self._contact / information) ** 2
         flicker = np.minimum(moved, OUTLIER / information + OUTLIER * self.now.flicker).mean(axis=0) - 1 / information
         self.now.flicker = np.maximum(FLICKER_FLOOR**2, self.now.flicker + share * flicker)
-        excess = self._excess(pulled, white.conditional_precisions()).mean(axis=0)
+        excess = self._excess(weighted_residual, white.conditional_precisions()).mean(axis=0)
         jitter = self.now.jitter + share * (self._squares * excess[:, None]).sum(axis=0) / self._weight
         self.now.jitter = np.where(jitter > JITTER_FLOOR**2, jitter, 0.0)
 
-    def _excess(self, pulled: Array, precision: Array) -> Array:
+    def _excess(self, weighted_residual: Array, precision: Array) -> Array:
         """By how much each measurement's squared residual, given all others, exceeds its variance."""
-        return np.asarray(np.minimum((pulled / precision) ** 2, OUTLIER / precision) - 1 / precision)
+        return np.asarray(np.minimum((weighted_residual / precision) ** 2, OUTLIER / precision) - 1 / precision)
 
 
 def in_blocks(columns: Array, order: Order, times: float) -> Array:

@@ -32,9 +32,9 @@ class DiscGrid:
         whitened = self.responses @ white.w.T.astype(np.float32)
         return np.asarray(np.einsum("ak,ak->a", whitened, whitened))
 
-    def likeliest(self, pulled: Array, information: Single) -> tuple[float, int, float]:
-        """z^2, number and action of the disc that explains most of a residual; pulled (K,): S^-1 of it."""
-        along = np.maximum(self.responses @ pulled.astype(np.float32), 0)
+    def likeliest(self, weighted_residual: Array, information: Single) -> tuple[float, int, float]:
+        """z^2, number and action of the disc that explains most of a residual; weighted_residual (K,): S^-1 of it."""
+        along = np.maximum(self.responses @ weighted_residual.astype(np.float32), 0)
         z2 = along**2 / information
         best = int(z2.argmax())
         return float(z2[best]), best, float(along[best] / information[best])

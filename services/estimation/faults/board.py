@@ -18,10 +18,8 @@ from models.measurement.covariance.whitening import Whitening, leave_out
 from models.measurement.fit import FoundTouches
 from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
-from services.estimation.asked.looked_at import LookedAt
-from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer
 from services.estimation.faults import advice, wires
-from services.estimation.faults.decided import DecidedState
+from services.estimation.faults.contact_state import ContactState
 from services.estimation.faults.impedance import (
     ContactChange,
     ContactColumns,
@@ -33,11 +31,13 @@ from services.estimation.faults.impedance import (
 from services.estimation.faults.table import BoardScan, WireTable
 from services.estimation.faults.wires import WireFault, WireKind, WireMaps
 from services.estimation.filter import Prediction
+from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, ScoredAnswer
+from services.estimation.hypotheses.observation import Observation
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Ask = Callable[[Question], ScoredAnswer]
+Ask = Callable[[Innovation], ScoredAnswer]
 Change = ContactChange | GainChange
 
 LEAST = -0.95  # relative: nothing takes all of an impedance away
@@ -71,11 +71,11 @@ class FaultState:
     log_gain_sound: float = 0.0  # before a gross step
     gross_since_s: float = np.inf  # no sound board's gain is as this one since then; inf: it is
     unexplained_scans: int = 0
-    doubt: DecidedState = field(default_factory=DecidedState)  # of the changed contact
+    doubt: ContactState = field(default_factory=ContactState)  # of the changed contact
 
 
 @dataclass(frozen=True)
-class AskedScan(LookedAt):
+class PredictedScan(Observation):
     """One scan that is asked about."""
 
     predicted: Prediction
@@ -86,7 +86,7 @@ class AskedScan(LookedAt):
 class BoardView:
     """One scan through the board."""
 
-    at: AskedScan
+    at: PredictedScan
     log_z: Array  # (K,) 0 where it failed
     sound: Array  # (K,) what a board with sound wires would show, untouched
     failed: Mask
@@ -126,11 +126,11 @@ class BoardView:
 
 
 @dataclass(frozen=True)
-class Asked:
+class Explanation:
     """What explains a scan."""
 
     view: BoardView
-    question: Question
+    innovation: Innovation
     answer: ScoredAnswer
     changed: bool = False  # a fault was found: the next scan is the first that it is taken off
 
@@ -183,7 +183,7 @@ class BoardFaults:
 
     # --- what it makes of a scan ---
 
-    def look(self, at: AskedScan) -> BoardView:
+    def look(self, at: PredictedScan) -> BoardView:
         now, values = self.now, at.scan.values
         at_s = at.middle_s + at.times_s
         sound = at.untouched + np.where(at_s >= now.gain_since_s, now.log_gain, now.log_gain_before)
@@ -255,7 +255,9 @@ class BoardFaults:
         white = Whitening.of(covariance + self._any_touch)
         y = np.where(view.live, view.y - np.log1p(touched), 0.0)
         scan = Unexplained(y, np.ones_like(y), view.live, view.at.times_s, view.at.span_s, white)
-        return max(gain_change(scan, since_s).score for since_s in (-np.inf, gain_onset(scan))) + float(n.COST_GAIN)
+        return max(gain_change(scan, since_s).score for since_s in (-np.inf, gain_onset(scan))) + float(
+            n.LOG_PRIOR_GAIN
+        )
 
     def _untouched(self, view: BoardView) -> BoardScan:
         """As the wires are asked about it: what open electrodes explain tells nothing of the others' wires."""
@@ -273,33 +275,33 @@ class BoardFaults:
         """Whether what explains a scan may as well be a fault."""
         if self.now.wire is not None and not self.exchanged:
             return False
-        fit, kept = answer.fit, answer.kept
-        new = fit is not None and any(kept[k] < 0 and self._may_be_a_contact(fit, k) for k in range(len(fit)))
+        fit, association = answer.fit, answer.association
+        new = fit is not None and any(association[k] < 0 and self._may_be_a_contact(fit, k) for k in range(len(fit)))
         return new or not answer.holds or answer.cause != AS_IT_IS or self.shared_z2(answer) > n.GAIN_Z2
 
     def shared_z2(self, answer: ScoredAnswer) -> float:
         """How much all values have in common beyond what explains a scan, in squared sigmas."""
-        even = np.ones(len(answer.pulled))
-        return float(answer.pulled.sum()) ** 2 / answer.information(even)
+        even = np.ones(len(answer.weighted_residual))
+        return float(answer.weighted_residual.sum()) ** 2 / answer.information(even)
 
     def explained_by_fault(
-        self, without: Asked, touched: Array, nearby: Array, ask: Ask, doubted: bool = False
-    ) -> Asked | None:
+        self, without: Explanation, touched: Array, nearby: Array, ask: Ask, doubted: bool = False
+    ) -> Explanation | None:
         """A contact or the gain that has changed, if that is likelier than what explains a scan without. touched (K,):
         relative change by touches that stand; nearby (K, K): covariance of what they may have changed by; ask: the
-        likeliest touches of a question. doubted: without one that stands and lies on an electrode.
+        likeliest touches of a innovation. doubted: without one that stands and lies on an electrode.
         """
-        view, question, answer = without.view, without.question, without.answer
-        if question.budget.left <= 0:  # what is left open is asked again with the scans that follow
+        view, innovation, answer = without.view, without.innovation, without.answer
+        if innovation.budget.left <= 0:  # what is left open is asked again with the scans that follow
             return None
         columns, any_touch = self._columns_now, view.through(self._any_touch)
         if view.slopes is not None:
             columns = columns.through(view.slopes)
-        changes = self._likeliest(question, columns, any_touch, touched, nearby, unexplained=not answer.holds)
-        question = replace(question, keeps=0.0)
-        best, least = None, answer.score + (n.COST_TOUCH + n.COST_SMALL if doubted else self._sure(answer))
+        changes = self._likeliest(innovation, columns, any_touch, touched, nearby, unexplained=not answer.holds)
+        innovation = replace(innovation, keeps=0.0)
+        best, least = None, answer.score + (n.LOG_PRIOR_TOUCH + n.LOG_PRIOR_SMALL if doubted else self._sure(answer))
         for k, change in enumerate(changes, 1):
-            asked, column = self._with(question.leaving(1 - k / len(changes)), columns, change)
+            asked, column = self._with(innovation.leaving(1 - k / len(changes)), columns, change)
             found = ask(asked)
             score = found.score + (0.0 if self._goes_on(change, view) else _cost(change))
             if score >= least and self._passes(change, column, found, score, answer):
@@ -307,10 +309,10 @@ class BoardFaults:
         if best is None:
             return None
         change, column, asked, found = best
-        self._take(view, change, float(column @ found.pulled))
+        self._take(view, change, float(column @ found.weighted_residual))
         if isinstance(change, ContactChange):
             self.now.doubt.beside = self._beside(change, found)
-        return Asked(view, asked, found, changed=True)
+        return Explanation(view, asked, found, changed=True)
 
     def _passes(self, change: Change, column: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer) -> bool:
         """Whether a change may be believed that is likely enough. column (K,): of unit variance of what it may be;
@@ -321,7 +323,7 @@ class BoardFaults:
         if self._beside(change, found) and score < answer.score + n.FAULT_SURE:
             return False  # a touch takes the contact along: both are not likelier for being seldom touches
         if isinstance(change, GainChange):  # else the touches of the answer explain all of it
-            told = abs(float(column @ found.pulled)) * n.GAIN_CHANGES >= n.GAIN_LEAST
+            told = abs(float(column @ found.weighted_residual)) * n.GAIN_CHANGES >= n.GAIN_LEAST
         else:
             told = _told(column, found)
         plainly = self._tells and found.chi2 < n.MOST and score > answer.score + n.WIRE_SURE
@@ -346,10 +348,11 @@ class BoardFaults:
         if answer.fit is None:
             return n.FAULT_SURE
         doubtful = [
-            place < 0 and self.on_electrode(state) for state, place in zip(answer.fit.states, answer.kept, strict=True)
+            place < 0 and self.on_electrode(state)
+            for state, place in zip(answer.fit.states, answer.association, strict=True)
         ]
         if any(doubtful):
-            return n.COST_SMALL * sum(doubtful)
+            return n.LOG_PRIOR_SMALL * sum(doubtful)
         return n.FAULT_SURE
 
     def on_electrode(self, state: Array) -> bool:
@@ -378,7 +381,7 @@ class BoardFaults:
 
     def _likeliest(
         self,
-        question: Question,
+        innovation: Innovation,
         columns: ContactColumns,
         any_touch: Array,
         touched: Array,
@@ -393,9 +396,9 @@ class BoardFaults:
         if unexplained and touched.any():
             tried.insert(0, (np.zeros_like(touched), np.zeros_like(nearby), float(n.MOST)))
         for touched, more, most_chi2 in tried:
-            y = np.where(question.live, question.y - np.log1p(touched), 0.0)
-            white = Whitening.of(question.covariance + more)
-            scan = Unexplained(y, 1 / (1 + touched), question.live, question.times_s, question.span_s, white)
+            y = np.where(innovation.live, innovation.y - np.log1p(touched), 0.0)
+            white = Whitening.of(innovation.covariance + more)
+            scan = Unexplained(y, 1 / (1 + touched), innovation.live, innovation.times_s, innovation.span_s, white)
             nothing = white.log_likelihood(y)
             best = max(self._every(scan, columns), key=lambda change: change.score + _cost(change))
             if isinstance(best, ContactChange) and abs(best.size) > n.CONTACT_MOST:
@@ -416,18 +419,18 @@ class BoardFaults:
             return found or [gains[0]]
         return [*found, *columns.likeliest(scan)]
 
-    def _with(self, question: Question, of_contacts: ContactColumns, change: Change) -> tuple[Question, Array]:
-        """The question with a change of any size, and its column (K,) of unit variance."""
-        acts = np.asarray(question.live & (question.times_s >= change.since_s), float)
+    def _with(self, innovation: Innovation, of_contacts: ContactColumns, change: Change) -> tuple[Innovation, Array]:
+        """The innovation with a change of any size, and its column (K,) of unit variance."""
+        acts = np.asarray(innovation.live & (innovation.times_s >= change.since_s), float)
         if isinstance(change, GainChange):
             column = n.GAIN_CHANGES * acts
-            return replace(question, covariance=question.covariance + np.outer(column, column)), column
-        course = 2 * question.times_s / question.span_s
-        y, columns = of_contacts.taken_off(question.y, acts, course, change)
-        wider = question.covariance + columns @ columns.T
+            return replace(innovation, covariance=innovation.covariance + np.outer(column, column)), column
+        course = 2 * innovation.times_s / innovation.span_s
+        y, columns = of_contacts.taken_off(innovation.y, acts, course, change)
+        wider = innovation.covariance + columns @ columns.T
         misfit = n.CONTACT_MISFIT * acts * of_contacts.mean(change.electrode, change.size)
         wider[np.diag_indices_from(wider)] += misfit**2
-        return replace(question, y=np.where(question.live, y, 0.0), covariance=wider), columns[:, 0]
+        return replace(innovation, y=np.where(innovation.live, y, 0.0), covariance=wider), columns[:, 0]
 
     def _apart(self, change: Change, answer: ScoredAnswer) -> bool:
         """An electrode under a touch that changes is not named: what it does is the touch's. One that stood may change
@@ -437,7 +440,7 @@ class BoardFaults:
             return True
         acts = answer.fit.states[:, ACTION] ** 2 > n.ACTS_Z2 * np.diag(answer.fit.covariance)[ACTION::STATES]
         priors = answer.fit.priors
-        for state, place, prior, there in zip(answer.fit.states, answer.kept, priors, acts, strict=True):
+        for state, place, prior, there in zip(answer.fit.states, answer.association, priors, acts, strict=True):
             still = place >= 0 and float(prior.sd[VELOCITY].max()) * SCAN_S <= 2 * n.STILL_WAY and answer.holds
             if there and self._reaches(state, change.electrode) and not still:
                 return False
@@ -458,7 +461,7 @@ class BoardFaults:
         if now.contact not in (-1, change.electrode) and not now.doubt.undecided:
             self._settle()
         if now.contact != change.electrode:
-            now.doubt = DecidedState()
+            now.doubt = ContactState()
         now.contact, now.contact_since_s, now.size_before = change.electrode, since_s, before
         now.size = max(before + n.CONTACT_CHANGES * told, LEAST)
         if now.size > before and not now.doubt.undecided:
@@ -539,13 +542,13 @@ class BoardFaults:
             return
         column = view.spread[:, 0]
         sd = float(np.sqrt(now.variance))
-        now.size = max(now.size + sd * float(column @ answer.pulled), LEAST)
+        now.size = max(now.size + sd * float(column @ answer.weighted_residual), LEAST)
         now.variance *= max(1 - answer.information(column), 1e-4)
 
     def drop_contact(self) -> None:
         """No contact has changed."""
         now = self.now
-        now.contact, now.size, now.variance, now.doubt = -1, 0.0, 0.0, DecidedState()
+        now.contact, now.size, now.variance, now.doubt = -1, 0.0, 0.0, ContactState()
 
     def _settle(self) -> None:
         """A changed contact is the skin's own from now on, be it as it was at the tare."""
@@ -578,11 +581,11 @@ class BoardFaults:
 
 def _told(column: Array, answer: ScoredAnswer) -> bool:
     """Whether an answer knows that there is a change; column (K,): of unit variance of what it may be."""
-    return float(column @ answer.pulled) ** 2 > n.ACTS_Z2 * max(1 - answer.information(column), 0.0)
+    return float(column @ answer.weighted_residual) ** 2 > n.ACTS_Z2 * max(1 - answer.information(column), 0.0)
 
 
 def _cost(change: Change) -> float:
-    return float(n.COST_GAIN if isinstance(change, GainChange) else n.COST_CONTACT)
+    return float(n.LOG_PRIOR_GAIN if isinstance(change, GainChange) else n.LOG_PRIOR_CONTACT)
 
 
 def _what(change: Change) -> int:

@@ -77,8 +77,8 @@ class WireTable:
         blind[0] = False
         left = np.where(scan.failed | blind | ~scan.known, 0.0, scan.log_z - np.log(np.maximum(values, 1e-9)))
         left = np.clip(left, -MOST_LOG, MOST_LOG)
-        told = np.where(scan.failed & blind, n.COST_EXPECTED_FAILURE, 0.0)
-        told += np.where(scan.failed ^ blind, n.COST_FAILURE, 0.0)
+        told = np.where(scan.failed & blind, n.LOG_PRIOR_EXPECTED_FAILURE, 0.0)
+        told += np.where(scan.failed ^ blind, n.LOG_PRIOR_FAILURE, 0.0)
         told[:, ~scan.known] = 0.0
         before = 0 if standing is None else 1 + self._maps.at[standing]
         found = list[WireGuess]()
@@ -113,4 +113,4 @@ def _cost(before: int, after: int) -> float:
     """Log prior of a change of state, 0 being sound wires."""
     if before == after:
         return 0.0
-    return float(n.COST_WIRE if not before or not after else 2 * n.COST_WIRE)
+    return float(n.LOG_PRIOR_WIRE if not before or not after else 2 * n.LOG_PRIOR_WIRE)

@@ -93,12 +93,14 @@ ANOTHER_Z2 = Number(16.0, "-", "z^2 of a further disc that is tried by evidence"
 WIDE_START = Number(
     4.1, "nat", "log prior that a new touch's wide start lacks", "derived: places 1.9 (sheet), actions 2.2 (1 to 100)"
 )
-COST_TOUCH = Number(-3.5, "nat", "log prior of a touch that begins in a scan", "derived: one in 30 scans")
-COST_DRIFT = Number(-7.0, "nat", "of faster drift", "derived: one in 1000 scans")
-COST_MEMORY = Number(-1.0, "nat", "of memories as large as foam's may be", "derived: one touch in three leaves more")
-COST_BURST = Number(-3.0, "nat", "of a known disturbance that grew", "derived: one in 20 scans")
-COST_NOISE = Number(-20.0, "nat", "of blocks with a noise of their own", "derived: 2 nats for each of ten figures")
-COST_WIDE = Number(-2.0, "nat", "of a response that is wrong by MISFIT_WIDE", "derived: one touch in 7")
+LOG_PRIOR_TOUCH = Number(-3.5, "nat", "log prior of a touch that begins in a scan", "derived: one in 30 scans")
+LOG_PRIOR_DRIFT = Number(-7.0, "nat", "of faster drift", "derived: one in 1000 scans")
+LOG_PRIOR_MEMORY = Number(
+    -1.0, "nat", "of memories as large as foam's may be", "derived: one touch in three leaves more"
+)
+LOG_PRIOR_BURST = Number(-3.0, "nat", "of a known disturbance that grew", "derived: one in 20 scans")
+LOG_PRIOR_NOISE = Number(-20.0, "nat", "of blocks with a noise of their own", "derived: 2 nats for each of ten figures")
+LOG_PRIOR_WIDE = Number(-2.0, "nat", "of a response that is wrong by MISFIT_WIDE", "derived: one touch in 7")
 BURST = Number(8.0, "-", "times a known disturbance's strength", "chosen: a drive that switches on is 10 times")
 MOST_NOISE = Number(4e-3, "-", "noise of a block under which a touch would still be seen", "derived: 1 N changes 1e-2")
 NEIGHBOURS = Number(
@@ -196,9 +198,9 @@ FAR = Number(
 )
 FALLS = Number(0.03, "-", "relative fall that no touch, warmth or noise makes", "measured: as the wiring of before")
 MISFIT_MOST = Number(10.0, "-", "times FALLS, beyond which a misfit counts no more", "chosen: a third")
-COST_WIRE = Number(-16.3, "nat", "log prior of a fault of the wires", "derived: one in 1e5 scans, 120 couples")
-COST_FAILURE = Number(-14.5, "nat", "of a measurement that fails for no reason", "derived: one in 2e6")
-COST_EXPECTED_FAILURE = Number(-3.0, "nat", "of one that a fault leaves nothing of", "derived: one in 20")
+LOG_PRIOR_WIRE = Number(-16.3, "nat", "log prior of a fault of the wires", "derived: one in 1e5 scans, 120 couples")
+LOG_PRIOR_FAILURE = Number(-14.5, "nat", "of a measurement that fails for no reason", "derived: one in 2e6")
+LOG_PRIOR_EXPECTED_FAILURE = Number(-3.0, "nat", "of one that a fault leaves nothing of", "derived: one in 20")
 WIRE_SURE = Number(30.0, "nat", "by which a fault of the wires must be likelier", "chosen: true ones win by hundreds")
 WIRE_APART = Number(10.0, "nat", "by which it must be likelier than another one", "derived: one error in 2e4")
 """Wires."""
@@ -213,8 +215,10 @@ CONTACTS_EXACT = Number(6, "-", "changes of contacts fitted exactly", "derived: 
 CONTACT_MISFIT = Number(2e-3, "-", "what its columns get wrong, relative", "measured: 0.5e-3 at 8 times, stub's mesh")
 GAIN_CHANGES = Number(0.1, "-", "log of a gain's step, one sigma", "data sheet: AD5940, RTIA and PGA")
 GAIN_LEAST = Number(5e-4, "-", "log of a gain's step that is one", "derived: five sigmas; drift explains smaller ones")
-COST_CONTACT = Number(-14.3, "nat", "log prior of a contact that changes", "derived: one in 1e5 scans, 16 electrodes")
-COST_GAIN = Number(-9.2, "nat", "of a gain that steps", "derived: one in 1e4 scans")
+LOG_PRIOR_CONTACT = Number(
+    -14.3, "nat", "log prior of a contact that changes", "derived: one in 1e5 scans, 16 electrodes"
+)
+LOG_PRIOR_GAIN = Number(-9.2, "nat", "of a gain that steps", "derived: one in 1e4 scans")
 FAULT_SURE = Number(8.0, "nat", "by which such a fault must be likelier than touches", "derived: one error in 3000")
 CONTACT_WALK_CHANGED = Number(0.1, "-", "walk of a changed contact in a scan, of itself", "measured: 9 times in 6.5 s")
 CONTACT_STILL = Number(
@@ -248,7 +252,9 @@ CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itsel
 ON_ELECTRODE = Number(0.2, "unit", "gap below which a touch changes an electrode's contact", "derived: its width")
 ACTS_Z2 = Number(9.0, "-", "squared sigmas of a touch's action, below which it may be none", "derived: 3 sigmas")
 SMALL = Number(0.2, "unit", "radius of a touch that may be an electrode's contact", "derived: an electrode's width")
-COST_SMALL = Number(-8.0, "nat", "log prior of such a touch on an electrode", "derived: share of the sheet that it is")
+LOG_PRIOR_SMALL = Number(
+    -8.0, "nat", "log prior of such a touch on an electrode", "derived: share of the sheet that it is"
+)
 CONTACT_DOUBTS = (1, 2, 8, 24, 72)  # whole scans of a touch on an electrode, at which it is asked whether it is one
 COUNT_DOUBTS = (2, 8, 24)  # whole scans of a touch, at which it is asked whether it is several
 WEAK = Number(0.3, "-", "of its greatest action, below which a touch on an electrode is doubted", "chosen: it goes")

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from models.measurement.covariance.whitening import leave_out
 from models.measurement.fit import FoundTouches
 from models.measurement.responses.tables import SkinTables
-from services.estimation.asked.hypotheses import Hypotheses
-from services.estimation.asked.question import AS_IT_IS, MEMORY, Question, ScoredAnswer, StepBudget
-from services.estimation.faults.board import LEAST, Asked, BoardFaults, BoardView
+from services.estimation.faults.board import LEAST, BoardFaults, BoardView, Explanation
 from services.estimation.faults.impedance import ContactChange, ContactColumns, Unexplained
+from services.estimation.hypotheses.hypotheses import Hypotheses
+from services.estimation.hypotheses.innovation import AS_IT_IS, MEMORY, Innovation, ScoredAnswer, StepBudget
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -28,13 +28,13 @@ EVERY = 16
 SETTLES = 3  # whole scans in which a change may go on
 
 
-class ContactDoubt:
+class ContactOrTouchTest:
     """Of one skin."""
 
     def __init__(self, tables: SkinTables, hypotheses: Hypotheses, faults: BoardFaults) -> None:
         self._tables, self._hypotheses, self._faults = tables, hypotheses, faults
 
-    def __call__(self, found: Asked, skin: Array, own: Array) -> FoundTouches | None:
+    def __call__(self, found: Explanation, skin: Array, own: Array) -> FoundTouches | None:
         """A whole scan that was explained with a changed contact. skin, own: as for `BoardView.covariance`, what
         touches that stand may do included. Returns the touch that it is.
         """
@@ -50,7 +50,7 @@ class ContactDoubt:
         scale = np.exp(np.where(view.live, view.log_z - view.sound - y, 0.0))
         covariance = (skin + own / doubt.scans) * scale[:, None] * scale
         leave_out(covariance, view.live)
-        asked = replace(found.question, y=y, covariance=covariance, budget=StepBudget(n.MOST_STEPS), keeps=0.0)
+        asked = replace(found.innovation, y=y, covariance=covariance, budget=StepBudget(n.MOST_STEPS), keeps=0.0)
         contact = self._contact(asked)
         nothing = asked.white.log_likelihood(y)
         if contact.size < 0 or contact.score - nothing < n.FALSE_ALARM_Z2 / 2:  # no touch would be seen in it
@@ -85,14 +85,14 @@ class ContactDoubt:
         left = np.expm1(np.minimum(view.log_z - view.sound, n.MISFIT_MOST)) - touched - known
         return np.where(view.live, np.log1p(np.maximum(left, LEAST)), 0.0)
 
-    def _contact(self, asked: Question) -> ContactChange:
+    def _contact(self, asked: Innovation) -> ContactChange:
         columns, now = self._faults.columns, self._faults.now
         columns = columns.with_change(now.contact, now.doubt.decided)
         whole = np.ones(len(asked.y))
         scan = Unexplained(asked.y, whole, asked.live, asked.times_s, asked.span_s, asked.white)
         return columns.changes(scan, np.array([now.contact]), np.array([-np.inf]))[0]
 
-    def _touch(self, asked: Question) -> ScoredAnswer:
+    def _touch(self, asked: Innovation) -> ScoredAnswer:
         k = self._faults.now.contact
         columns: ContactColumns = self._faults.columns
         second = n.TOUCH_SECOND * np.column_stack([columns.layer[:, k], columns.rest[:, k]])

@@ -20,12 +20,12 @@ Priors = Sequence[TouchPrior]
 ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
 JUST_BEFORE_S = 1e-5  # a value: the next scans, by whose clock its time is rounded, must not leave it out
-COSTS = {
+LOG_PRIORS = {
     AS_IT_IS: 0.0,
-    MEMORY: float(n.COST_MEMORY),
-    DRIFT: float(n.COST_DRIFT),
-    BURST: float(n.COST_BURST),
-    NOISE: float(n.COST_NOISE),
+    MEMORY: float(n.LOG_PRIOR_MEMORY),
+    DRIFT: float(n.LOG_PRIOR_DRIFT),
+    BURST: float(n.LOG_PRIOR_BURST),
+    NOISE: float(n.LOG_PRIOR_NOISE),
 }
 
 
@@ -45,7 +45,7 @@ class StepBudget:
 
 
 @dataclass(frozen=True)
-class Question:
+class Innovation:
     """One scan, with what is predicted of it without touches."""
 
     y: Array  # (K,) log |Z| over the prediction; 0 where a measurement does not count
@@ -53,7 +53,7 @@ class Question:
     live: NDArray[np.bool_]
     times_s: Array  # (K,) from the middle of the scan
     span_s: float
-    said_s: float  # for when what touches is said, from the middle of the scan on
+    sample_s: float  # for when what touches is said, from the middle of the scan on
     order: NDArray[np.intp]  # (K,) rank in time, 0 the oldest
     part: int  # that it ends with
     information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
@@ -70,7 +70,7 @@ class Question:
     @property
     def touch_log_prior(self) -> float:
         """Of a touch that begins [nat]."""
-        return n.COST_TOUCH + (n.WIDE_START if self.by_evidence else 0.0)
+        return n.LOG_PRIOR_TOUCH + (n.WIDE_START if self.by_evidence else 0.0)
 
     @property
     def least_z2(self) -> float:
@@ -93,7 +93,7 @@ class Question:
         """Shares of the scan after which a disc is looked for: none where all values are of one instant."""
         return ONSETS if np.ptp(self.times_s) > 0 else ()
 
-    def leaving(self, share: float) -> Question:
+    def leaving(self, share: float) -> Innovation:
         """The same, which leaves so much of its steps to the next."""
         return replace(self, keeps=self.keeps + share * max(0.0, self.budget.left - self.keeps))
 
@@ -108,12 +108,12 @@ class ScoredAnswer:
 
     cause: str
     fit: FoundTouches | None  # None: nothing touches
-    kept: tuple[int, ...]  # for each touch of the fit the standing one that it continues; -1: new
+    association: tuple[int, ...]  # for each touch of the fit the standing one that it continues; -1: new
     chi2: float
-    left_z2: float  # of the best further disc
+    next_touch_z2: float  # of the best further disc
     score: float  # log evidence and prior
     white: Whitening
-    pulled: Array  # (K,) S^-1 of the residual
+    weighted_residual: Array  # (K,) S^-1 of the residual
     left: Array  # (K,)
     recounted: bool = False  # its touches are others than those that stood
     near: bool = False  # a new touch lies on another one: such two are one
@@ -122,7 +122,7 @@ class ScoredAnswer:
 
     @property
     def explained(self) -> bool:
-        return self.chi2 < n.GOOD and self.left_z2 < n.FALSE_ALARM_Z2 and not self.near
+        return self.chi2 < n.GOOD and self.next_touch_z2 < n.FALSE_ALARM_Z2 and not self.near
 
     @property
     def count(self) -> int:
@@ -130,7 +130,7 @@ class ScoredAnswer:
 
     @property
     def quiet(self) -> bool:
-        return self.chi2 < n.QUIET and self.left_z2 < n.FALSE_ALARM_Z2 * max(1.0, self.chi2)
+        return self.chi2 < n.QUIET and self.next_touch_z2 < n.FALSE_ALARM_Z2 * max(1.0, self.chi2)
 
     @property
     def holds(self) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import PreReconstructor
-from services.estimation.first.baseline import LEAST_NOISE, Baseline
+from services.estimation.initialisation.baseline import LEAST_NOISE, Baseline
 from services.estimation.values import numbers
 from services.estimation.values.state import shaped
 

@@ -21,7 +21,7 @@ class SlowState:
     looked_s: float = 0.0  # when it was asked last
 
 
-class SlowLook:
+class SlowOnsetTest:
     """Of one skin, while nothing touches."""
 
     def __init__(self, drift: SkinFilter) -> None:

@@ -25,7 +25,7 @@ class SizeAt:
 
 
 @dataclass
-class DecidedState:
+class ContactState:
     """All that changes. Sizes are relative changes of the contact impedance."""
 
     undecided: bool = False  # what goes beyond `decided` may be a touch

@@ -15,10 +15,10 @@ from scipy.optimize import nnls
 
 from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anywhere, plain
-from services.estimation.asked.hypotheses import Hypotheses
-from services.estimation.asked.question import (
+from services.estimation.hypotheses.hypotheses import Hypotheses
+from services.estimation.hypotheses.innovation import (
+    Innovation,
     Priors,
-    Question,
     ScoredAnswer,
     begun_as,
     likeliest,
@@ -35,7 +35,7 @@ HALVED_ANGLES = np.arange(8) * np.pi / 8  # along which two discs are tried inst
 HALVED_APART = (0.6, 1.0, 1.4)  # how far each lies from its middle, in radii
 
 
-class Recount:
+class SplitMergeTest:
     """Of one skin, seen as its hypotheses see it."""
 
     def __init__(self, hypotheses: Hypotheses, separate: bool) -> None:
@@ -44,75 +44,75 @@ class Recount:
         self._hypotheses = copy(hypotheses)
         self._hypotheses.wide = False  # what explains everything would hide how many there are
 
-    def __call__(self, question: Question, answer: ScoredAnswer) -> ScoredAnswer | None:
+    def __call__(self, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer | None:
         """Other touches than those of an answer, where they are likelier: None where they are not."""
         fit = answer.fit
         assert fit is not None
         ask, new = self._hypotheses, (-1,) * len(fit)
-        begun = begun_as(fit, question.span_s)
-        same = self._same(question, answer, begun)
-        discs = ask.fitted(question, [plain(prior) for prior in begun], new, n.STEPS_COLD)
+        begun = begun_as(fit, innovation.span_s)
+        same = self._same(innovation, answer, begun)
+        discs = ask.fitted(innovation, [plain(prior) for prior in begun], new, n.STEPS_COLD)
         enough = max(each.score for each in (*same, discs)) + self._least_gain
-        found = [discs, *ask.search(question, discs, begun)]
+        found = [discs, *ask.search(innovation, discs, begun)]
         assert same[0].fit is not None
         if (pair := neighbours(same[0].fit.states, new)) is not None:
-            found += ask.merged(question, same[0], *pair)
+            found += ask.merged(innovation, same[0], *pair)
         elif not any(other.explained and other.score > enough for other in found):
             oddest = np.argsort([-oddness(shape) for shape in fit.shapes])
-            for one in takewhile(lambda _: not question.spent, oddest):
-                found += self._halved(question, begun, discs, int(one))
+            for one in takewhile(lambda _: not innovation.spent, oddest):
+                found += self._halved(innovation, begun, discs, int(one))
         if not any(other.explained for other in found):
-            found += ask.search(question)
+            found += ask.search(innovation)
         others = [other for other in found if other.explained and _others(other.fit, fit)]
         if not others or likeliest(others).score < enough:
             return None
         return likeliest(others)
 
-    def _same(self, question: Question, answer: ScoredAnswer, begun: Priors) -> list[ScoredAnswer]:
+    def _same(self, innovation: Innovation, answer: ScoredAnswer, begun: Priors) -> list[ScoredAnswer]:
         """As many touches, as they are and by what else the answer explains its scan with."""
         ask, new = self._hypotheses, (-1,) * len(begun)
-        found = [ask.fitted(question, begun, new, n.STEPS_COLD)]
+        found = [ask.fitted(innovation, begun, new, n.STEPS_COLD)]
         if answer.wide:
-            found.append(ask.fitted(question, begun, new, n.STEPS_COLD, wide=True))
+            found.append(ask.fitted(innovation, begun, new, n.STEPS_COLD, wide=True))
         if answer.cause:
-            found += ask.with_cause(question, begun, new, answer.cause, answer.left)
+            found += ask.with_cause(innovation, begun, new, answer.cause, answer.left)
         return found
 
-    def _halved(self, question: Question, begun: Priors, discs: ScoredAnswer, one: int) -> list[ScoredAnswer]:
+    def _halved(self, innovation: Innovation, begun: Priors, discs: ScoredAnswer, one: int) -> list[ScoredAnswer]:
         """Two discs instead of one: a disc beside one that lies between two leads to neither. begun: the touches of
         those discs, with their outlines.
         """
         fit = discs.fit
         if fit is None or len(fit) >= n.MOST_TOUCHES:
             return []
-        halves = self._halves(question, fit, one)
+        halves = self._halves(innovation, fit, one)
         if not halves:
             return []
         as_discs, new = started_from(fit), (-1,) * (len(fit) + 1)
         rest = [k for k in range(len(fit)) if k != one]
         found = self._hypotheses.fitted(
-            question, [*(as_discs[k] for k in rest), *map(plain, halves)], new, 2 * n.STEPS_COLD
+            innovation, [*(as_discs[k] for k in rest), *map(plain, halves)], new, 2 * n.STEPS_COLD
         )
         outlined = started([*(begun[k] for k in rest), *halves], found.fit)
-        both = found, self._hypotheses.fitted(question, outlined, new, n.STEPS_COLD)
+        both = found, self._hypotheses.fitted(innovation, outlined, new, n.STEPS_COLD)
         return [other for other in both if other.fit is not None and gaps(other.fit.states).min() > 0]
 
-    def _halves(self, question: Question, fit: FoundTouches, one: int) -> list[TouchPrior]:
+    def _halves(self, innovation: Innovation, fit: FoundTouches, one: int) -> list[TouchPrior]:
         """The two discs that explain most of what one does, on either side of its middle; empty where none explain
         more than that one, and the next scans are asked too.
         """
-        white, response = question.white, self._hypotheses.response
+        white, response = innovation.white, self._hypotheses.response
         each = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) for s in fit.states]
-        target = white(np.where(question.live, np.expm1(question.y) - sum(each) + each[one], 0.0))
+        target = white(np.where(innovation.live, np.expm1(innovation.y) - sum(each) + each[one], 0.0))
         halves, least = list[TouchPrior](), np.inf
         if not self._separate:
-            least = float(np.linalg.norm(target - white(np.where(question.live, each[one], 0.0))))
+            least = float(np.linalg.norm(target - white(np.where(innovation.live, each[one], 0.0))))
         for places, radius in _pairs(fit.states[one]):
             both = np.stack([response(*place, radius) for place in places], axis=1)
-            actions, left = nnls(white(np.where(question.live[:, None], both, 0.0)), target)
+            actions, left = nnls(white(np.where(innovation.live[:, None], both, 0.0)), target)
             if left < least and actions.min() > 0:
                 least = left
-                halves = [anywhere(*at, acts, question.span_s) for at, acts in zip(places, actions, strict=True)]
+                halves = [anywhere(*at, acts, innovation.span_s) for at, acts in zip(places, actions, strict=True)]
         return halves
 
 

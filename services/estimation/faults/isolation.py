@@ -14,21 +14,21 @@ from models.measurement.covariance.noise import NoiseModel
 from models.measurement.fit import LEAST_MEAN
 from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import ACTION, TouchPrior
-from services.estimation.asked.hypotheses import Hypotheses
-from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, begun_as
-from services.estimation.faults.board import Asked, AskedScan, BoardFaults, BoardView, as_they_stand
-from services.estimation.faults.doubt import ContactDoubt
+from services.estimation.faults.board import BoardFaults, BoardView, Explanation, PredictedScan, as_they_stand
+from services.estimation.faults.contact_or_touch import ContactOrTouchTest
 from services.estimation.faults.wires import WireFault
+from services.estimation.hypotheses.hypotheses import Hypotheses
+from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, ScoredAnswer, begun_as
 from services.estimation.touches import TouchTracks
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
-MakeQuestion = Callable[[Hypotheses, BoardView, Array], Question]
-Answering = Callable[[Hypotheses, Question], ScoredAnswer]
-Recounting = Callable[[Hypotheses, Question, ScoredAnswer], ScoredAnswer]
+MakeQuestion = Callable[[Hypotheses, BoardView, Array], Innovation]
+Selecting = Callable[[Hypotheses, Innovation], ScoredAnswer]
+Recounting = Callable[[Hypotheses, Innovation, ScoredAnswer], ScoredAnswer]
 
 
-class FaultAsking:
+class FaultIsolation:
     """Of one skin."""
 
     def __init__(
@@ -36,11 +36,13 @@ class FaultAsking:
     ) -> None:
         self._tables, self._noise, self._touches = tables, noise, touches
         self._hypotheses, self._faults = hypotheses, faults
-        self._contact_doubt = ContactDoubt(tables, hypotheses, faults)
+        self._contact_doubt = ContactOrTouchTest(tables, hypotheses, faults)
         self._through: tuple[WireFault, Hypotheses] | None = None
 
-    def __call__(self, at: AskedScan, question_of: MakeQuestion, answering: Answering, recounting: Recounting) -> Asked:
-        """question_of: of hypotheses, a view and a covariance; answering: the likeliest touches of a question;
+    def __call__(
+        self, at: PredictedScan, innovation_of: MakeQuestion, answering: Selecting, recounting: Recounting
+    ) -> Explanation:
+        """innovation_of: of hypotheses, a view and a covariance; answering: the likeliest touches of an innovation;
         recounting: rather others than those of an answer.
         """
         faults = self._faults
@@ -51,18 +53,18 @@ class FaultAsking:
             if not faults.suspects_wires(view):
                 return False
             touched, _ = self._change(standing, at)
-            return faults.wires_changed(view, touched, skin + self._hypotheses.faster_drift(), own)
+            return faults.wires_changed(view, touched, skin + self._hypotheses.inflated_drift(), own)
 
-        def asked(view: BoardView) -> Asked:
+        def asked(view: BoardView) -> Explanation:
             hypotheses = self._seen(view)
-            question = question_of(hypotheses, view, view.covariance(skin, own))
-            return Asked(view, question, recounting(hypotheses, question, answering(hypotheses, question)))
+            innovation = innovation_of(hypotheses, view, view.covariance(skin, own))
+            return Explanation(view, innovation, recounting(hypotheses, innovation, answering(hypotheses, innovation)))
 
         view = faults.look(at)
         if faults.now.wire is None and rewired(view):
             view = faults.look(at)
         found = asked(view)
-        odd = _doubtful(found.answer) or -1 in found.answer.kept
+        odd = _doubtful(found.answer) or -1 in found.answer.association
         if faults.now.wire is not None and odd and rewired(view):
             found = asked(faults.look(at))
         if faults.now.opens and faults.now.wire is None and (odd or (at.whole and self._touches.in_doubt)):
@@ -71,34 +73,36 @@ class FaultAsking:
             found = self._changed(found, at, *self._change(standing, at), answering)
         return self._doubted(found, at)
 
-    def _lifted(self, found: Asked, ask: Callable[[], Asked]) -> Asked:
+    def _lifted(self, found: Explanation, ask: Callable[[], Explanation]) -> Explanation:
         """Electrodes that are open may be off the skin, or on it and cut off: whichever explains the scan better. A
         touch that has just come is not known well enough to decide by little: the scans that follow ask again.
         """
         now = self._faults.now
         before, now.lifted = now.lifted, () if now.lifted else now.opens
         other = ask()
-        sure = n.WIRE_SURE if -1 in found.answer.kept else n.FAULT_SURE
+        sure = n.WIRE_SURE if -1 in found.answer.association else n.FAULT_SURE
         if (other.answer.holds, other.answer.score) > (found.answer.holds, found.answer.score + sure):
             return other
         now.lifted = before
         return found
 
-    def _changed(self, found: Asked, at: AskedScan, touched: Array, nearby: Array, answering: Answering) -> Asked:
+    def _changed(
+        self, found: Explanation, at: PredictedScan, touched: Array, nearby: Array, answering: Selecting
+    ) -> Explanation:
         hypotheses = self._seen(found.view)
 
         fit = found.answer.fit
         likely = () if fit is None else begun_as(fit, at.span_s)
 
-        def ask(other: Question) -> ScoredAnswer:
-            return answering(hypotheses, replace(other, candidates=likely, places=found.answer.kept))
+        def ask(other: Innovation) -> ScoredAnswer:
+            return answering(hypotheses, replace(other, candidates=likely, places=found.answer.association))
 
         if found.view.slopes is not None:
             touched = np.maximum(found.view.slopes @ touched, LEAST_MEAN)
         nearby = found.view.through(nearby)
         return self._faults.explained_by_fault(found, touched, nearby, ask) or found
 
-    def _doubted(self, found: Asked, at: AskedScan) -> Asked:
+    def _doubted(self, found: Explanation, at: PredictedScan) -> Explanation:
         """Is a touch on an electrode its contact impedance? Asked at some ages, when it has become weak, and when it
         does not plainly explain a scan: a contact that changes under a touch is left when the touch goes.
         """
@@ -107,7 +111,7 @@ class FaultAsking:
         for k, track in enumerate(self._touches.now.tracks):
             weak = track.state[ACTION] < n.WEAK * track.peak
             asked = track.scans in n.CONTACT_DOUBTS or weak or _doubtful(found.answer)
-            if track.told and not _doubtful(found.answer):
+            if track.told_from_contact and not _doubtful(found.answer):
                 continue
             if not asked or track.ended or not self._faults.on_electrode(track.state):
                 continue
@@ -122,7 +126,7 @@ class FaultAsking:
                 return other
         return found
 
-    def decide(self, found: Asked) -> None:
+    def decide(self, found: Explanation) -> None:
         """Whether a contact that has changed is a touch on its electrode, once a whole scan is explained with it: one
         that is new, or that stands by now.
         """
@@ -140,21 +144,21 @@ class FaultAsking:
             self._touches.tell(touch, at.middle_s, at.span_s)
         elif self._faults.now.contact < 0:
             for track in self._touches.now.tracks:
-                track.told = self._faults.on_electrode(track.state)
-                track.sure = track.sure or track.told
+                track.told_from_contact = self._faults.on_electrode(track.state)
+                track.confirmed = track.confirmed or track.told_from_contact
 
-    def _covariances(self, at: AskedScan) -> tuple[Array, Array]:
+    def _covariances(self, at: PredictedScan) -> tuple[Array, Array]:
         """(K, K) of what changes with the skin, and of what the measurements add."""
         contact = self._tables.contact
         flicker = (contact * self._noise.now.flicker) @ contact.T
         return at.predicted.covariance + flicker, self._noise.covariance(at.scan.part) - flicker
 
-    def _with(self, standing: list[TouchPrior], loose: list[TouchPrior], question: Question) -> ScoredAnswer:
+    def _with(self, standing: list[TouchPrior], loose: list[TouchPrior], innovation: Innovation) -> ScoredAnswer:
         if standing:
-            return self._hypotheses.ask(replace(question, candidates=(), places=()), standing, loose)
-        return self._hypotheses.untouched(question)
+            return self._hypotheses.ask(replace(innovation, candidates=(), places=()), standing, loose)
+        return self._hypotheses.untouched(innovation)
 
-    def _change(self, priors: Sequence[TouchPrior], at: AskedScan, but: int = -1) -> tuple[Array, Array]:
+    def _change(self, priors: Sequence[TouchPrior], at: PredictedScan, but: int = -1) -> tuple[Array, Array]:
         """(K,) what touches that stand do to each |Z|, and (K, K) the covariance of what they may have changed by: a
         strong one's outline and misfit are more than a contact impedance that begins to change. But: a track that is
         left out. The outline of a touch that has just come is not known: what is odd about it is no contact.

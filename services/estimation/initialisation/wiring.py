@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from models.measurement.responses.tables import SkinTables
 from services.estimation.faults.table import BoardScan, WireTable, any_touches
 from services.estimation.faults.wires import WireFault, WireMaps
-from services.estimation.first.start import LADDER, grain, smooth_field
+from services.estimation.initialisation.start import LADDER, grain, smooth_field
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 
 
-class WiresAtStart:
+class WiringTest:
     """Of one skin; tables: of its bundle."""
 
     def __init__(self, tables: SkinTables) -> None:

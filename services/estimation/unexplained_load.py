@@ -24,7 +24,7 @@ class RefusedState:
     seconds: float = 0.0
 
 
-class RefusedChange:
+class UnexplainedLoad:
     """Of one skin."""
 
     def __init__(self, measurements: int) -> None:

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Waiting:
+class PendingScan:
     """An untouched scan that waits to be believed."""
 
     at_s: float
@@ -31,10 +31,10 @@ class Waiting:
 class LearningState:
     """All that changes."""
 
-    waiting: list[Waiting] = field(default_factory=list)
+    waiting: list[PendingScan] = field(default_factory=list)
 
 
-class Learning:
+class DelayedUpdate:
     def __init__(self, drift: SkinFilter, noise: NoiseModel) -> None:
         self._drift, self._noise = drift, noise
         self.now = LearningState()
@@ -47,7 +47,7 @@ class Learning:
         """The gain has, of late: what was taken for drift may have been that."""
         self.now.waiting = [scan for scan in self.now.waiting if not scan.drifts]
 
-    def untouched(self, scan: Waiting) -> None:
+    def untouched(self, scan: PendingScan) -> None:
         """A scan on which nothing touches, by all that is known: `catch_up` learns from those that waited enough."""
         self.now.waiting.append(scan)
 
@@ -59,14 +59,14 @@ class Learning:
         if len(waiting) > n.LAG_SCANS:
             self._take_in(waiting.pop(0))
 
-    def _take_in(self, scan: Waiting) -> None:
+    def _take_in(self, scan: PendingScan) -> None:
         if scan.drifts:
             self._drift.widen(scan.drifts)
-        predicted = self._drift.ahead(scan.at_s, self._noise.now.flicker)
+        predicted = self._drift.predict(scan.at_s, self._noise.now.flicker)
         covariance = self._noise.covariance(scan.part) + predicted.covariance
         leave_out(covariance, scan.live)
         white = Whitening.of(covariance)
         y = np.where(scan.live, scan.over - predicted.shift, 0.0)
-        pulled = self._drift.take_in(predicted, y, white)
+        weighted_residual = self._drift.update(predicted, y, white)
         if not scan.drifts and scan.live.all():
-            self._noise.learn(pulled, white)
+            self._noise.learn(weighted_residual, white)

@@ -14,7 +14,7 @@ from models.measurement.covariance.noise import BURST_BLOCK
 from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import KnownWhitening, Turned
 from models.measurement.responses.grid import DiscGrid
-from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer
+from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, ScoredAnswer
 from services.estimation.values import numbers as n
 from services.estimation.values.scan import Scan
 
@@ -35,7 +35,7 @@ class Glance:
 
     at_s: float
     white: Whitening
-    even_variance: float  # of what all values share, by the filter
+    common_mode_variance: float  # of what all values share, by the filter
     newest: dict[int, Newest] = field(default_factory=dict)  # by the part measured last
 
     @cached_property
@@ -70,11 +70,11 @@ class Seen:
 
     quiet: bool
     z2: float
-    pulled: Array  # (K,)
+    weighted_residual: Array  # (K,)
     y: Array  # (K,) what was looked at
 
 
-class QuickLook:
+class NullGate:
     """Keeps what is needed for all parts that are disturbed alike, by NoiseModel.alike; nothing that a replay would
     miss.
     """
@@ -94,16 +94,16 @@ class QuickLook:
         alike: int,
         at_s: float,
         ids: tuple[int, ...],
-        question: Question,
+        innovation: Innovation,
         answer: ScoredAnswer,
-        even_variance: float,
+        common_mode_variance: float,
     ) -> None:
         """Of a scan with which nothing is wrong; ids: of what touches."""
         self._held.pop(alike, None)
         if (fit := answer.fit) is None:
-            self._glances[alike] = Glance(at_s, question.white, even_variance)
+            self._glances[alike] = Glance(at_s, innovation.white, common_mode_variance)
         elif answer.cause == AS_IT_IS and answer.explained:
-            self._held[alike] = HeldGlance(at_s, ids, question.covariance, fit.known, fit.turned)
+            self._held[alike] = HeldGlance(at_s, ids, innovation.covariance, fit.known, fit.turned)
 
     def held(self, alike: int, at_s: float, ids: tuple[int, ...]) -> HeldGlance | None:
         """None: nothing is known of such scans under these touches."""
@@ -117,20 +117,24 @@ class QuickLook:
         at_s: float,
         y: Array,
         information: NDArray[np.float32],
-        even_variance: float,
+        common_mode_variance: float,
     ) -> Seen | None:
-        """y (K,): log |Z| over the prediction, 0 where it does not count. even_variance: by now. None: nothing is known
-        of such scans, or the filter has become so much surer since that it would overlook a step of the gain.
+        """y (K,): log |Z| over the prediction, 0 where it does not count. common_mode_variance: by now. None: nothing
+        is known of such scans, or the filter has become so much surer since that it would overlook a step of the gain.
         """
         known = self._glances.get(alike)
-        if known is None or not 0 <= at_s - known.at_s < n.GLANCE_S or even_variance < n.SURER * known.even_variance:
+        if (
+            known is None
+            or not 0 <= at_s - known.at_s < n.GLANCE_S
+            or common_mode_variance < n.SURER * known.common_mode_variance
+        ):
             return None
         residual = known.white(y)
-        pulled = known.white.w.T @ residual
+        weighted_residual = known.white.w.T @ residual
         chi2 = float(residual @ residual) / max(int(np.count_nonzero(y)), 1)
         newest = known.newest_of(scan.part, scan.ages_s)
-        own = pulled[newest.rows]
+        own = weighted_residual[newest.rows]
         fresh = float(own @ newest.energy @ own) - len(own)
-        z2 = max(self._grid.likeliest(pulled, information)[0], fresh)
-        even = float(pulled.sum()) ** 2 / known.told_of_even < n.GAIN_Z2
-        return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, z2, pulled, y)
+        z2 = max(self._grid.likeliest(weighted_residual, information)[0], fresh)
+        even = float(weighted_residual.sum()) ** 2 / known.told_of_even < n.GAIN_Z2
+        return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, z2, weighted_residual, y)

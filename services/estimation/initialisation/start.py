@@ -87,7 +87,7 @@ class EarlierBaseline:
     covariance: Array  # (K, K) of what has drifted since
 
 
-class StartJudge:
+class TouchAtStartTest:
     """Of one skin; tables: of its bundle."""
 
     def __init__(self, tables: SkinTables) -> None:
@@ -151,16 +151,16 @@ class StartLadder:
         least = float(n.START_SEEN**2 * np.quantile(information, n.START_SEEN_SHARE))
         scene = FittedScan(self._y, covariance, self._course, self._misfit, int(self._live.sum()))
         fit = None if nothing else self._touched(scene, white, information)
-        touched = -np.inf if fit is None else fit.evidence + n.COST_TOUCH * len(fit) + log_prior
+        touched = -np.inf if fit is None else fit.evidence + n.LOG_PRIOR_TOUCH * len(fit) + log_prior
         return Rung(times, cost == 0, density + log_prior, touched, least, fit)
 
     def _touched(self, scene: FittedScan, white: Whitening, information: NDArray[np.float32]) -> FoundTouches | None:
         """Touches one after the other, each found as a disc, while they add evidence."""
-        pulled = white.solve(self._y)
+        weighted_residual = white.solve(self._y)
         best: FoundTouches | None = None
         priors = list[TouchPrior]()
         for _ in range(int(n.START_TOUCHES)):
-            z2, disc, action = self._grid.likeliest(pulled, information)
+            z2, disc, action = self._grid.likeliest(weighted_residual, information)
             if z2 < n.FALSE_ALARM_Z2:
                 break
             x, y = self._grid.discs[disc, PLACE]
@@ -168,7 +168,7 @@ class StartLadder:
             fit = TouchFitter(scene, priors, self._error).fit(int(n.STEPS_COLD))
             if best is not None and fit.evidence < best.evidence + n.ANOTHER:
                 break
-            best, pulled = fit, fit.pulled
+            best, weighted_residual = fit, fit.weighted_residual
         return best
 
 

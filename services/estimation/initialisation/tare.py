@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from models.measurement.responses.tables import FIELD_DEGREES, SkinTables
 from protocol.errors import EitskinError
 from services.estimation.faults.wires import WireFault, WireKind
-from services.estimation.first.baseline import LEAST_NOISE, agreement, identical, untrained
-from services.estimation.first.start import EarlierBaseline, JudgedStart, StartJudge, StartSays
-from services.estimation.first.wiring import WiresAtStart
+from services.estimation.initialisation.baseline import LEAST_NOISE, agreement, identical, untrained
+from services.estimation.initialisation.start import EarlierBaseline, JudgedStart, StartSays, TouchAtStartTest
+from services.estimation.initialisation.wiring import WiringTest
 from services.estimation.values import numbers as n
 from services.estimation.values.judgement import Judgement, judge
 from services.estimation.values.scan import Scan
@@ -203,7 +203,7 @@ class Taring:
 
     def use(self, tables: SkinTables) -> None:
         """Of the same skin, known better."""
-        self._tables, self._start, self._wires = tables, StartJudge(tables), WiresAtStart(tables)
+        self._tables, self._start, self._wires = tables, TouchAtStartTest(tables), WiringTest(tables)
 
     def offer(self, scan: Scan, live: NDArray[np.bool_], middle_s: float) -> None:
         """A whole scan; live (K,): what of it was measured; middle_s: when. One that is not believed interrupts."""

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.touch import ACTION, PLACE, RATE, VELOCITY, TouchPrior
-from services.estimation.asked.question import Question, StepBudget, begun_at
+from services.estimation.hypotheses.innovation import Innovation, StepBudget, begun_at
 from services.estimation.values.scan import Scan
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class LookedAt:
+class Observation:
     """A scan as the estimator looks at it."""
 
     scan: Scan
@@ -43,7 +43,7 @@ class LookedAt:
         return self.middle_s + self.span_s / 2
 
     @property
-    def said_s(self) -> float:
+    def sample_s(self) -> float:
         """For when what touches is said, from the middle of the scan on."""
         return self.scan.sample_ns * 1e-9 - self.middle_s
 
@@ -57,7 +57,7 @@ class LookedAt:
         """(K,) rank in time, 0 the oldest."""
         return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
 
-    def question(
+    def innovation(
         self,
         y: Array,
         covariance: Array,
@@ -65,15 +65,15 @@ class LookedAt:
         information: NDArray[np.float32],
         candidates: tuple[TouchPrior, ...],
         places: tuple[int, ...] = (),
-    ) -> Question:
+    ) -> Innovation:
         """About this scan."""
-        return Question(
+        return Innovation(
             y=y,
             covariance=covariance,
             live=live,
             times_s=self.times_s,
             span_s=self.span_s,
-            said_s=self.said_s,
+            sample_s=self.sample_s,
             order=self.order,
             part=self.scan.part,
             information=information,
@@ -92,7 +92,7 @@ class OpenTouch:
     since_s: float  # host's clock
     id: int = 0  # of the one that it continues; 0: none
 
-    def begun(self, measured: LookedAt) -> TouchPrior:
+    def begun(self, measured: Observation) -> TouchPrior:
         """Anywhere in the next scan, searched from where it was at the end of that one: how it goes on nobody knows."""
         state, half_s = self.state.copy(), measured.span_s / 2
         state[PLACE] += half_s * state[VELOCITY]

@@ -8,15 +8,17 @@ import numpy as np
 
 from models.measurement.fit import FoundTouches
 from models.measurement.touch import LOG_RADIUS
-from services.estimation.asked.looked_at import LookedAt
-from services.estimation.asked.question import AS_IT_IS, Question, ScoredAnswer, started_from
 from services.estimation.filter import Memory
+from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, ScoredAnswer, started_from
+from services.estimation.hypotheses.observation import Observation
 from services.estimation.tared import TaredSkin
 from services.estimation.touches import TouchTracks, TrackedTouch
 from services.estimation.values import numbers as n
 
 
-def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt, unexplained_s: float) -> None:
+def update_tracks(
+    skin: TaredSkin, innovation: Innovation, answer: ScoredAnswer, measured: Observation, unexplained_s: float
+) -> None:
     """Take over what an answer says of the touches. unexplained_s: for how long nothing has explained the scans."""
     if answer.fit is None:
         memories = skin.touches.forget(measured.oldest_s)
@@ -24,30 +26,30 @@ def settle(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         memories = _associate(skin, answer, answer.fit, measured)
         _confirm(skin, answer, measured)
         if measured.whole and not (answer.recounted or measured.scan.separate):
-            rest = replace(question, keeps=0.0)
+            rest = replace(innovation, keeps=0.0)
             _doubt(skin, rest, answer, measured, strange=unexplained_s > n.CHANGING_S)
-        if answer.explained and all(track.sure for track in skin.touches.now.tracks):
+        if answer.explained and all(track.confirmed for track in skin.touches.now.tracks):
             skin.touches.now.dropped = []
     skin.remember(memories)
     wide = answer.fit is not None and answer.wide
     if answer.explained and wide != skin.hypotheses.wide:
         skin.hypotheses.wide = wide
-        skin.forget_looks()
+        skin.forget_gates()
 
 
-def _associate(skin: TaredSkin, answer: ScoredAnswer, fit: FoundTouches, measured: LookedAt) -> list[Memory]:
+def _associate(skin: TaredSkin, answer: ScoredAnswer, fit: FoundTouches, measured: Observation) -> list[Memory]:
     """Tracks go on, begin or end with the touches of a fit. Returns what those that ended leave in the foam."""
     touches = skin.touches
-    kept = touches.recognised(fit, answer.kept)
+    association = touches.associated(fit, answer.association)
     if answer.recounted:
-        touches.correct(fit, kept)
-    gone = [k for k in range(len(touches)) if k not in kept]
+        touches.correct(fit, association)
+    gone = [k for k in range(len(touches)) if k not in association]
     memories = [memory for k in gone for memory in touches.released(k, measured.oldest_s)]
-    skin.slow.forget()
-    return memories + touches.settle(fit, kept, measured, answer.explained)
+    skin.slow_onset.forget()
+    return memories + touches.update(fit, association, measured, answer.explained)
 
 
-def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: LookedAt) -> None:
+def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> None:
     """A touch is shown at once where its scan is explained with it: a rough start may be anything. One that stands by
     itself (separate) is the end, too.
     """
@@ -58,12 +60,12 @@ def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: LookedAt) -> None:
     may_wait = skin.tables.predicted and not measured.scan.separate
     for track in skin.touches.now.tracks:
         told = track.z2 > least or (place_tells and _placed(track))
-        track.sure = track.sure or (told and not skin.faults.in_question(track.state))
+        track.confirmed = track.confirmed or (told and not skin.faults.in_question(track.state))
         if may_wait and _broad(track):
-            track.sure = False
+            track.confirmed = False
 
 
-def _least_z2(skin: TaredSkin, answer: ScoredAnswer, measured: LookedAt) -> float:
+def _least_z2(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> float:
     """Squared sigmas of its action from which a touch is shown at once."""
     if not skin.tables.predicted:  # its strength is known badly: that scans are not quiet without it was asked
         return 0.0
@@ -82,7 +84,7 @@ def _broad(track: TrackedTouch) -> bool:
     return bool(track.state[LOG_RADIUS] > np.log(n.BROAD)) and track.scans < n.SURE_SCANS
 
 
-def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: LookedAt, strange: bool) -> None:
+def _doubt(skin: TaredSkin, innovation: Innovation, answer: ScoredAnswer, measured: Observation, strange: bool) -> None:
     """Is one of the touches drift, or nothing? What was shown once must not stay because nothing is learnt under
     it, nor because it costs nothing: a touch that is doubted counts as a new one. strange: nothing has explained the
     scans of late, so that one which only lasts is no touch yet.
@@ -93,20 +95,20 @@ def _doubt(skin: TaredSkin, question: Question, answer: ScoredAnswer, measured: 
         track = touches.now.tracks[k]
         if not _doubted(track):
             continue
-        standing, least = touches.expected(measured.middle_s, measured.span_s), float(n.COST_TOUCH)
+        standing, least = touches.expected(measured.middle_s, measured.span_s), float(n.LOG_PRIOR_TOUCH)
         if answer.fit is not None and k in meeting and len(touches) == len(answer.fit):
             standing, least = started_from(answer.fit), -least  # it is known by itself: it would have ended
-        other = skin.hypotheses.without(question, standing, k)
-        if other.quiet and other.score > answer.score + least and touches.stay(other.fit, other.kept):
+        other = skin.hypotheses.without(innovation, standing, k)
+        if other.quiet and other.score > answer.score + least and touches.stay(other.fit, other.association):
             none.append((other.score - least, k))
-        elif not track.sure and not skin.faults.in_question(track.state):
-            track.sure = _lasts(track, touches, strange) or _needed(track, touches, answer, other)
+        elif not track.confirmed and not skin.faults.in_question(track.state):
+            track.confirmed = _lasts(track, touches, strange) or _needed(track, touches, answer, other)
     if none:
         touches.remove(max(none)[1])
 
 
 def _doubted(track: TrackedTouch) -> bool:
-    return not track.ended and (track.z2 < n.DOUBT_Z2 or not track.sure or track.doubt_due)
+    return not track.ended and (track.z2 < n.DOUBT_Z2 or not track.confirmed or track.doubt_due)
 
 
 def _needed(track: TrackedTouch, touches: TouchTracks, answer: ScoredAnswer, other: ScoredAnswer) -> bool:

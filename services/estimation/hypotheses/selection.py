@@ -8,67 +8,69 @@ from dataclasses import replace
 import numpy as np
 
 from models.measurement.responses.tables import SkinTables
-from services.estimation.asked.hypotheses import Hypotheses
-from services.estimation.asked.looked_at import LookedAt
-from services.estimation.asked.question import AS_IT_IS, Priors, Question, ScoredAnswer, StepBudget
-from services.estimation.asked.recount import Recount
 from services.estimation.filter import Prediction
+from services.estimation.hypotheses.hypotheses import Hypotheses
+from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Priors, ScoredAnswer, StepBudget
+from services.estimation.hypotheses.observation import Observation
+from services.estimation.hypotheses.split_merge import SplitMergeTest
 from services.estimation.tared import TaredSkin
 from services.estimation.values import numbers as n
 
 
-class Answering:
+class HypothesisSelection:
     """Of one scan."""
 
     def __init__(
-        self, tables: SkinTables, skin: TaredSkin, measured: LookedAt, predicted: Prediction, unexplained_s: float
+        self, tables: SkinTables, skin: TaredSkin, measured: Observation, predicted: Prediction, unexplained_s: float
     ) -> None:
         """unexplained_s: for how long nothing has explained the scans before."""
         self._tables, self._skin, self._measured = tables, skin, measured
         self._predicted, self._unexplained_s = predicted, unexplained_s
         self._searched = False  # anew, whatever stands: once, it costs four scans' steps
 
-    def answer(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+    def answer(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """The likeliest one."""
         if not self._tables.predicted:
-            return self._of_measured(hypotheses, question)
+            return self._of_measured(hypotheses, innovation)
         if self._unexplained_s > n.LOST_S:
-            return self._of_lost(hypotheses, question)
-        return self._of_touched(hypotheses, question)
+            return self._of_lost(hypotheses, innovation)
+        return self._of_touched(hypotheses, innovation)
 
-    def _of_touched(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+    def _of_touched(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         if not len(self._skin.touches):
-            return self._of_untouched(hypotheses, question)
+            return self._of_untouched(hypotheses, innovation)
         standing = self._skin.touches.expected(self._measured.middle_s, self._measured.span_s)
         loose = self._skin.touches.expected(self._measured.middle_s, self._measured.span_s, loose=True)
         if self._skin.touches.lost:
-            return _judged_by_itself(hypotheses, question, standing, loose)
-        for answer in self._first_of_whole(hypotheses, question, standing):
+            return _judged_by_itself(hypotheses, innovation, standing, loose)
+        for answer in self._first_of_whole(hypotheses, innovation, standing):
             if answer.explained:
                 return answer
-        return hypotheses.ask(question, standing, loose)
+        return hypotheses.ask(innovation, standing, loose)
 
-    def _first_of_whole(self, hypotheses: Hypotheses, question: Question, standing: Priors) -> Iterator[ScoredAnswer]:
+    def _first_of_whole(
+        self, hypotheses: Hypotheses, innovation: Innovation, standing: Priors
+    ) -> Iterator[ScoredAnswer]:
         """What is asked of a whole scan before all else."""
         if not self._measured.whole:
             return
         if self._unexplained_s > 0 and not self._searched:
             self._searched = True  # they may be others than those that stand
-            yield self._from_nothing(hypotheses, question)
+            yield self._from_nothing(hypotheses, innovation)
         if hypotheses.wide:
-            yield hypotheses.narrow(question, standing)
+            yield hypotheses.narrow(innovation, standing)
 
-    def _of_untouched(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+    def _of_untouched(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """Where nothing touched: nothing does, or what presses again where foam remembers more than it may, or all."""
-        quiet = hypotheses.untouched(question)
-        memory = self._skin.drift.beyond_memory(self._predicted, quiet.pulled, quiet.white)
+        quiet = hypotheses.untouched(innovation)
+        memory = self._skin.drift.beyond_memory(self._predicted, quiet.weighted_residual, quiet.white)
         if memory is not None and self._measured.whole and self._skin.faults.now.wire is None:
-            pressed = hypotheses.at(question, memory.x, memory.y)
+            pressed = hypotheses.at(innovation, memory.x, memory.y)
             if pressed.explained:
                 return pressed
-        return quiet if quiet.quiet else hypotheses.ask(question, (), ())
+        return quiet if quiet.quiet else hypotheses.ask(innovation, (), ())
 
-    def recounted(self, hypotheses: Hypotheses, question: Question, answer: ScoredAnswer) -> ScoredAnswer:
+    def recounted(self, hypotheses: Hypotheses, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
         """An answer, or rather more touches than it has, or fewer. Asked with steps of its own: what explains a scan
         badly has spent those of the scan, and would never be asked otherwise.
         """
@@ -77,8 +79,8 @@ class Answering:
         scan = self._measured.scan
         if not (_strained(answer) or self._skin.touches.odd or scan.separate):
             return answer
-        own = replace(question, budget=StepBudget.of(1.0, scan.separate), keeps=0.0, by_evidence=True)
-        recount = Recount(hypotheses, scan.separate)
+        own = replace(innovation, budget=StepBudget.of(1.0, scan.separate), keeps=0.0, by_evidence=True)
+        recount = SplitMergeTest(hypotheses, scan.separate)
         other = found = recount(own, answer)
         while other is not None and not own.spent:
             other = recount(own, other)
@@ -87,50 +89,50 @@ class Answering:
             return answer
         if found.count < answer.count and self._skin.touches.meeting(self._measured.middle_s):
             return answer  # they stood apart a moment ago: that they are several is known
-        kept = self._skin.touches.recognised(found.fit, found.kept)
-        known = sum(place >= 0 for place in kept)
-        return replace(found, kept=kept, score=found.score - own.touch_log_prior * known, recounted=True)
+        association = self._skin.touches.associated(found.fit, found.association)
+        known = sum(place >= 0 for place in association)
+        return replace(found, association=association, score=found.score - own.touch_log_prior * known, recounted=True)
 
-    def _of_measured(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+    def _of_measured(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """Of a skin whose touches no response tells, or one that real touches differ from by more than anybody knows.
         While something touches that nothing explains, all else is asked seldom.
         """
         unexplained_s, map_known = self._unexplained_s, self._tables.tells
-        often = unexplained_s <= n.CHANGING_S or not round(unexplained_s / question.span_s) % n.LOST_SCANS
+        often = unexplained_s <= n.CHANGING_S or not round(unexplained_s / innovation.span_s) % n.LOST_SCANS
         if not often:
-            question.budget.left = 0.0
+            innovation.budget.left = 0.0
         elif map_known and len(self._skin.touches):
-            return self._of_touched(hypotheses, question)
-        found = hypotheses.untold(question, self._skin.refused.now.column, often and not map_known)
+            return self._of_touched(hypotheses, innovation)
+        found = hypotheses.of_unmodelled(innovation, self._skin.refused.now.column, often and not map_known)
         if found.quiet or not (often and map_known):
             return found
-        return self._of_touched(hypotheses, question)
+        return self._of_touched(hypotheses, innovation)
 
-    def _of_lost(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+    def _of_lost(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """While nothing has explained the skin for long: a search now and then, from nothing."""
         self._skin.remember(self._skin.touches.forget(self._measured.oldest_s))
-        found = hypotheses.glance(question)
+        found = hypotheses.glance(innovation)
         refused = round(self._unexplained_s / self._measured.span_s)
         if found.quiet or not self._measured.whole or refused % n.LOST_SCANS:
             return found
-        return self._from_nothing(hypotheses, question)
+        return self._from_nothing(hypotheses, innovation)
 
-    def _from_nothing(self, hypotheses: Hypotheses, question: Question) -> ScoredAnswer:
+    def _from_nothing(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """Whatever touches, with the steps of a scan that stands by itself."""
-        return hypotheses.ask(replace(question, budget=StepBudget.of(1.0, separate=True), keeps=0.0), (), ())
+        return hypotheses.ask(replace(innovation, budget=StepBudget.of(1.0, separate=True), keeps=0.0), (), ())
 
 
-def _judged_by_itself(hypotheses: Hypotheses, question: Question, standing: Priors, loose: Priors) -> ScoredAnswer:
+def _judged_by_itself(hypotheses: Hypotheses, innovation: Innovation, standing: Priors, loose: Priors) -> ScoredAnswer:
     """After lost time, or a board's reset, nothing vouches for what touched before. The likeliest of: the touches that
     there were, which count as new ones; others, or none.
     """
-    anew = hypotheses.ask(question.leaving(0.5), (), ())
-    before = hypotheses.ask(question, standing, loose)
-    kept = sum(place >= 0 for place in before.kept)
-    vouched = replace(before, score=before.score + question.touch_log_prior * kept)
+    anew = hypotheses.ask(innovation.leaving(0.5), (), ())
+    before = hypotheses.ask(innovation, standing, loose)
+    association = sum(place >= 0 for place in before.association)
+    vouched = replace(before, score=before.score + innovation.touch_log_prior * association)
     return max((anew, vouched), key=lambda answer: (answer.holds, answer.score))
 
 
 def _strained(answer: ScoredAnswer) -> bool:
     """Whether touches explain a scan only roughly, or with the help of something else."""
-    return answer.cause != AS_IT_IS or not answer.explained or (answer.wide and -1 in answer.kept)
+    return answer.cause != AS_IT_IS or not answer.explained or (answer.wide and -1 in answer.association)
