@@ -73,6 +73,8 @@ class TrackedTouch:
     told_from_contact: bool = False  # several scans told it from a changed contact impedance
     lost: bool = False  # scans were lost since: it may be anywhere
     peak: float = 0.0  # action that it surely had
+    surely: float = 0.0  # action that it has, at least, by the last fit
+    jumped: bool = False  # the last fit has it elsewhere
     held: float = 0.0  # action before it began to go
     load: float = 0.0  # action that foam has felt of late
     load_s: float = 0.0  # by then
@@ -249,7 +251,7 @@ class TouchTracks:
             _update(track, fit.states[k], fit.covariance[own, own], at_s, span_s, whole)
             if whole and k not in meeting:  # what two have in common is no outline of one
                 _learn(track, fit, k)
-            if explained:
+            if explained and (whole or not track.jumped):
                 memories += self._held(track, at_s, span_s, whole)
             memories += self._ending(k, fit.priors[k], at_s, span_s)
         if -1 in association:
@@ -320,10 +322,8 @@ class TouchTracks:
         """Whether the tracks that a fit goes on with are where they were: one that moved away is another one."""
         if fit is None:
             return True
-        found = zip(fit.states, (self.now.tracks[place] for place in association), strict=True)
-        return all(
-            np.hypot(*(state[PLACE] - track.state[PLACE])) < max(n.SAME_TOUCH, _radius(track)) for state, track in found
-        )
+        found = zip(fit.states, association, strict=True)
+        return all(_away(self.now.tracks[place], state) < n.SAME_TOUCH for state, place in found)
 
     def remove(self, place: int) -> None:
         """It was none."""
@@ -396,6 +396,11 @@ def _same_place(state: Array, other: Array) -> bool:
     return bool(np.hypot(*(state[PLACE] - other[PLACE])) < max(n.SAME_TOUCH, float(np.exp(widest))))
 
 
+def _away(track: TrackedTouch, state: Array) -> float:
+    """From where a track was to where a state (7,) has it."""
+    return float(np.hypot(*(state[PLACE] - track.state[PLACE])))
+
+
 def _radius(track: TrackedTouch) -> float:
     return float(np.exp(track.state[LOG_RADIUS]))
 
@@ -443,6 +448,7 @@ def _expected(track: TrackedTouch, at_s: float, span_s: float, loose: bool) -> T
 
 
 def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, span_s: float, whole: bool) -> None:
+    track.jumped = not (track.lost or track.ended) and _away(track, state) > max(n.SAME_TOUCH, _radius(track))
     track.state, track.covariance, track.at_s, track.lost = state, covariance, at_s, False
     acts = [_action_at(state, covariance, after_s) for after_s in (0.0, span_s / 2)]
     track.z2 = max((max(action, 0.0) / sd) ** 2 for action, sd in acts)
@@ -460,7 +466,9 @@ def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, s
     track.scans += whole
     if whole:
         _follow_place(track)
-    track.peak = max(track.peak, float(state[ACTION] - 2 * sd[ACTION]))
+    before, track.surely = track.surely, float(state[ACTION] - 2 * sd[ACTION])
+    # The few new values of one part may be explained by any touch, also where none is the reason.
+    track.peak = max(track.peak, track.surely if whole else min(before, track.surely))
 
 
 def _follow_place(track: TrackedTouch) -> None:

@@ -61,7 +61,7 @@ def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> No
     for track in skin.touches.now.tracks:
         told = track.z2 > least or (place_tells and _placed(track))
         track.confirmed = track.confirmed or (told and not skin.faults.in_question(track.state))
-        if may_wait and _broad(track):
+        if may_wait and (_broad(track) or (track.jumped and not measured.whole)):
             track.confirmed = False
 
 
