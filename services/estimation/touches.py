@@ -251,7 +251,7 @@ class TouchTracks:
             _update(track, fit.states[k], fit.covariance[own, own], at_s, span_s, whole)
             if whole and k not in meeting:  # what two have in common is no outline of one
                 _learn(track, fit, k)
-            if explained and (whole or not track.jumped):
+            if explained:
                 memories += self._held(track, at_s, span_s, whole)
             memories += self._ending(k, fit.priors[k], at_s, span_s)
         if -1 in association:
@@ -365,7 +365,7 @@ class TouchTracks:
         """Take note of what presses, and where. Of a touch that slid away returns what the place remembers where it
         stayed. A fit that does not explain its scan must not get here: it is anywhere while a touch is released.
         """
-        if track.ended:
+        if track.ended or (track.jumped and not whole):
             return []
         acts, now_s = float(track.state[ACTION]), at_s + span_s / 2
         goes = min(acts, float(acts + track.state[RATE] * span_s / 2)) <= n.GOES * track.held
