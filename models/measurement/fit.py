@@ -173,6 +173,10 @@ class _Linear:
 
 
 class TouchFitter:
+    """Gauss and Newton's steps, damped as Levenberg's, to the maximum a posteriori of some touches; at it, Laplace's
+    approximation.
+    """
+
     def __init__(self, scene: FittedScan, priors: Sequence[TouchPrior], misfit: float = MISFIT) -> None:
         self._scene, self._priors, self._misfit = scene, tuple(priors), misfit
         self._count = len(self._priors)

@@ -35,6 +35,8 @@ class LearningState:
 
 
 class DelayedUpdate:
+    """The filter's update by untouched scans, with a fixed lag of two: none by what turns out to be a touch's begin."""
+
     def __init__(self, drift: SkinFilter, noise: NoiseModel) -> None:
         self._drift, self._noise = drift, noise
         self.now = LearningState()

@@ -72,6 +72,8 @@ class Prediction:
 
 
 class SkinFilter:
+    """The Kalman filter of an untouched skin's log |Z|."""
+
     def __init__(self, tables: SkinTables) -> None:
         self._tables = tables
         self.contacts = slice(2 * MODES, 2 * MODES + tables.electrodes)

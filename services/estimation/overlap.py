@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass
 class TrackMotion:
-    """What scans that share no value told of one touch, the last at `at_s`."""
+    """A filter of constant velocity: what scans that share no value told of one touch, the last at `at_s`."""
 
     at_s: float
     x: float

@@ -113,7 +113,7 @@ class TouchesState:
 
 
 class TouchTracks:
-    """Of one skin."""
+    """The tracks of one skin's touches: tentative, confirmed or ended."""
 
     def __init__(self, response: TouchModel) -> None:
         self._response = response

@@ -76,7 +76,7 @@ class FaultState:
 
 @dataclass(frozen=True)
 class PredictedScan(Observation):
-    """One scan that is asked about."""
+    """An observation with what the filter predicts of it."""
 
     predicted: Prediction
     untouched: Array  # (K,) log |Z| as the filter predicts it
@@ -289,7 +289,7 @@ class BoardFaults:
     ) -> Explanation | None:
         """A contact or the gain that has changed, if that is likelier than what explains a scan without. touched (K,):
         relative change by touches that stand; nearby (K, K): covariance of what they may have changed by; ask: the
-        likeliest touches of a innovation. doubted: without one that stands and lies on an electrode.
+        likeliest touches of an innovation. doubted: without one that stands and lies on an electrode.
         """
         view, innovation, answer = without.view, without.innovation, without.answer
         if innovation.budget.left <= 0:  # what is left open is asked again with the scans that follow
@@ -420,7 +420,7 @@ class BoardFaults:
         return [*found, *columns.likeliest(scan)]
 
     def _with(self, innovation: Innovation, of_contacts: ContactColumns, change: Change) -> tuple[Innovation, Array]:
-        """The innovation with a change of any size, and its column (K,) of unit variance."""
+        """The innovation beside a change of any size, and its column (K,) of unit variance."""
         acts = np.asarray(innovation.live & (innovation.times_s >= change.since_s), float)
         if isinstance(change, GainChange):
             column = n.GAIN_CHANGES * acts

@@ -29,7 +29,9 @@ SETTLES = 3  # whole scans in which a change may go on
 
 
 class ContactOrTouchTest:
-    """Of one skin."""
+    """The likelihood ratio of a changed contact impedance and a touch on its electrode, over the mean of the scans
+    since it began: a sequential test that decides beyond either of two thresholds.
+    """
 
     def __init__(self, tables: SkinTables, hypotheses: Hypotheses, faults: BoardFaults) -> None:
         self._tables, self._hypotheses, self._faults = tables, hypotheses, faults

@@ -26,7 +26,7 @@ class SizeAt:
 
 @dataclass
 class ContactState:
-    """All that changes. Sizes are relative changes of the contact impedance."""
+    """All that changes of one contact that has changed. Sizes are relative changes of its impedance."""
 
     undecided: bool = False  # what goes beyond `decided` may be a touch
     decided: float = 0.0

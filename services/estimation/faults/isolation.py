@@ -29,7 +29,7 @@ Recounting = Callable[[Hypotheses, Innovation, ScoredAnswer], ScoredAnswer]
 
 
 class FaultIsolation:
-    """Of one skin."""
+    """Which fault of the board, if any, explains a scan better than touches alone."""
 
     def __init__(
         self, tables: SkinTables, noise: NoiseModel, touches: TouchTracks, hypotheses: Hypotheses, faults: BoardFaults

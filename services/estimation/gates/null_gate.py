@@ -75,8 +75,9 @@ class Seen:
 
 
 class NullGate:
-    """Keeps what is needed for all parts that are disturbed alike, by NoiseModel.alike; nothing that a replay would
-    miss.
+    """Gates of one skin: whether a scan is what noise alone makes of the prediction, by chi^2, the strongest disc and
+    the newest values. It keeps whitenings for all parts that are disturbed alike, by NoiseModel.alike; nothing that a
+    replay would miss.
     """
 
     def __init__(self, grid: DiscGrid) -> None:

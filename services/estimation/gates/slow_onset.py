@@ -22,7 +22,7 @@ class SlowState:
 
 
 class SlowOnsetTest:
-    """Of one skin, while nothing touches."""
+    """Of one skin, while nothing touches: holds scans against the filter as it was some seconds ago, a fixed lag."""
 
     def __init__(self, drift: SkinFilter) -> None:
         self._drift = drift

@@ -18,7 +18,9 @@ Array = NDArray[np.float64]
 
 
 class TouchDetector:
-    """Of one skin; wrong: share of a touch's change that its response gets wrong."""
+    """The generalised likelihood ratio of one further disc, over all discs of a grid and instants at which it may have
+    begun. wrong: share of a touch's change that its response gets wrong.
+    """
 
     def __init__(self, grid: DiscGrid, wrong: float) -> None:
         self._grid, self._wrong = grid, wrong

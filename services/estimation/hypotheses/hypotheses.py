@@ -100,7 +100,7 @@ def _releases(
 
 
 class Hypotheses:
-    """Of one skin."""
+    """What may explain a scan of one skin, each fitted and scored by its log evidence and log prior."""
 
     def __init__(self, tables: SkinTables, noise: NoiseModel, drift: SkinFilter) -> None:
         self.grid, self.response, self.detector = tables.grid, tables.response, TouchDetector(tables.grid, tables.wrong)

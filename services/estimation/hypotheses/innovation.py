@@ -46,7 +46,9 @@ class StepBudget:
 
 @dataclass(frozen=True)
 class Innovation:
-    """One scan, with what is predicted of it without touches."""
+    """The innovation of one scan: y over the prediction without touches, its covariance S, and what is known of the
+    touches that there may be; with the steps that hypotheses about it may cost.
+    """
 
     y: Array  # (K,) log |Z| over the prediction; 0 where a measurement does not count
     covariance: Array  # (K, K)

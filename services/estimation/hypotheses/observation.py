@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Observation:
-    """A scan as the estimator looks at it."""
+    """One scan as it was observed: log |Z|, which measurements count, and when each was taken."""
 
     scan: Scan
     log_z: Array  # (K,) 0 where a measurement does not count

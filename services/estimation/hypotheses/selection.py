@@ -18,7 +18,7 @@ from services.estimation.values import numbers as n
 
 
 class HypothesisSelection:
-    """Of one scan."""
+    """Which hypotheses are asked of one scan, and which of their answers is taken."""
 
     def __init__(
         self, tables: SkinTables, skin: TaredSkin, measured: Observation, predicted: Prediction, unexplained_s: float

@@ -36,7 +36,7 @@ HALVED_APART = (0.6, 1.0, 1.4)  # how far each lies from its middle, in radii
 
 
 class SplitMergeTest:
-    """Of one skin, seen as its hypotheses see it."""
+    """The evidence of more touches, or of fewer, than an answer has. Of one skin, seen as its hypotheses see it."""
 
     def __init__(self, hypotheses: Hypotheses, separate: bool) -> None:
         """separate: of scans that stand by themselves: evidence alone decides, and no later one is asked again."""

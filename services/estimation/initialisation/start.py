@@ -88,7 +88,9 @@ class EarlierBaseline:
 
 
 class TouchAtStartTest:
-    """Of one skin; tables: of its bundle."""
+    """The likelihood ratio of a touch and of a skin that differs from its bundle, over the first scans. tables: of its
+    bundle.
+    """
 
     def __init__(self, tables: SkinTables) -> None:
         self._tables = tables

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class WiringTest:
-    """Of one skin; tables: of its bundle."""
+    """Which fault of the wires explains the first scans. tables: of the skin's bundle."""
 
     def __init__(self, tables: SkinTables) -> None:
         self.maps = WireMaps(tables.pattern)
