@@ -33,8 +33,8 @@ def arrays_of_tables(tables: ResponseTables) -> dict[str, Any]:
 
 
 def tables_of(arrays: Mapping[str, npt.NDArray[Any]], electrodes: int) -> ResponseTables:
-    """The tables that a response.npz of a skin with so many electrodes holds; further arrays are
-    not read. Raises Wrong.
+    """The tables that a response.npz of a skin with so many electrodes holds; further arrays are not read.
+    Raises Wrong.
     """
     missing = [name for name in ("fields", "inside") if name not in arrays]
     if missing:

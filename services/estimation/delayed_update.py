@@ -57,11 +57,11 @@ class DelayedUpdate:
         """Takes longer than a look at a quiet scan: what is said of a scan does not wait for it."""
         waiting = self.now.waiting
         if waiting and waiting[-1].drifts > 1:  # the filter was lost: what explains this scan now is the skin
-            self._take_in(waiting.pop())
+            self._update(waiting.pop())
         if len(waiting) > n.LAG_SCANS:
-            self._take_in(waiting.pop(0))
+            self._update(waiting.pop(0))
 
-    def _take_in(self, scan: PendingScan) -> None:
+    def _update(self, scan: PendingScan) -> None:
         if scan.drifts:
             self._drift.widen(scan.drifts)
         predicted = self._drift.predict(scan.at_s, self._noise.now.flicker)

@@ -272,15 +272,14 @@ class Estimator:
         middle_s, live = measured.middle_s, measured.live
         if len(skin.touches) or self.now.unexplained_s or not self._complete(skin, live) or not measured.whole:
             return None
-        then = (
-            skin.slow_onset.due(middle_s) if skin.faults.plain(measured.oldest_s) and self._tables.predicted else None
-        )
+        if not (skin.faults.plain(measured.oldest_s) and self._tables.predicted):
+            return None
+        then = skin.slow_onset.due(middle_s)
         if then is None:
             return None
         predicted = then.predict(middle_s, skin.noise.now.flicker)
-        covariance = (
-            skin.noise.covariance(measured.scan.part) + predicted.covariance + then.inflated_process_noise(n.SLOW_TIMES)
-        )
+        covariance = skin.noise.covariance(measured.scan.part) + predicted.covariance
+        covariance += then.inflated_process_noise(n.SLOW_TIMES)
         leave_out(covariance, live)
         y = np.where(live, measured.log_z - skin.log_z0 - predicted.shift, 0.0)
         information = skin.hypotheses.grid.information(Whitening.of(covariance))
@@ -404,12 +403,12 @@ class Estimator:
     def _explaining(self, skin: TaredSkin, measured: Observation) -> Explanation:
         predicted = skin.drift.predict(measured.middle_s, skin.noise.now.flicker)
         own = measured.scan, measured.log_z, measured.live, measured.whole, measured.budget
-        answering = HypothesisSelection(self._tables, skin, measured, predicted, self.now.unexplained_s)
+        selection = HypothesisSelection(self._tables, skin, measured, predicted, self.now.unexplained_s)
         return skin.isolation(
             PredictedScan(*own, predicted, skin.log_z0 + predicted.shift),
             lambda hypotheses, view, covariance: self._scan_innovation(hypotheses, skin, view, covariance, measured),
-            answering.answer,
-            answering.recounted,
+            selection.answer,
+            selection.recounted,
         )
 
     def _scan_innovation(

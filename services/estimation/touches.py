@@ -224,7 +224,7 @@ class TouchTracks:
         free = [k for k, track in enumerate(self.now.tracks) if k not in association and not track.ended]
         found = list(association)
         for k, place in enumerate(association):
-            near = [(float(np.hypot(*(self.now.tracks[f].state[PLACE] - fit.states[k, PLACE]))), f) for f in free]
+            near = [(_apart(self.now.tracks[f].state, fit.states[k]), f) for f in free]
             if place >= 0 or not near:
                 continue
             nearest = min(near)[1]
@@ -323,7 +323,7 @@ class TouchTracks:
         if fit is None:
             return True
         found = zip(fit.states, association, strict=True)
-        return all(_away(self.now.tracks[place], state) < n.SAME_TOUCH for state, place in found)
+        return all(_apart(self.now.tracks[place].state, state) < n.SAME_TOUCH for state, place in found)
 
     def remove(self, place: int) -> None:
         """It was none."""
@@ -393,12 +393,12 @@ def oddness(shape: Array) -> float:
 def _same_place(state: Array, other: Array) -> bool:
     """Whether a touch (7,) that was found anew is in the place of another one."""
     widest = max(state[LOG_RADIUS], other[LOG_RADIUS])
-    return bool(np.hypot(*(state[PLACE] - other[PLACE])) < max(n.SAME_TOUCH, float(np.exp(widest))))
+    return _apart(state, other) < max(n.SAME_TOUCH, float(np.exp(widest)))
 
 
-def _away(track: TrackedTouch, state: Array) -> float:
-    """From where a track was to where a state (7,) has it."""
-    return float(np.hypot(*(state[PLACE] - track.state[PLACE])))
+def _apart(state: Array, other: Array) -> float:
+    """Distance of the places of two states (7,) [unit]."""
+    return float(np.hypot(*(state[PLACE] - other[PLACE])))
 
 
 def _radius(track: TrackedTouch) -> float:
@@ -448,7 +448,7 @@ def _expected(track: TrackedTouch, at_s: float, span_s: float, loose: bool) -> T
 
 
 def _update(track: TrackedTouch, state: Array, covariance: Array, at_s: float, span_s: float, whole: bool) -> None:
-    track.jumped = not (track.lost or track.ended) and _away(track, state) > max(n.SAME_TOUCH, _radius(track))
+    track.jumped = not (track.lost or track.ended) and _apart(track.state, state) > max(n.SAME_TOUCH, _radius(track))
     track.state, track.covariance, track.at_s, track.lost = state, covariance, at_s, False
     acts = [_action_at(state, covariance, after_s) for after_s in (0.0, span_s / 2)]
     track.z2 = max((max(action, 0.0) / sd) ** 2 for action, sd in acts)
@@ -557,7 +557,8 @@ def estimate_of(track: TrackedTouch, sample_s: float, span_s: float, unexplained
 
 
 def coasted(touch: TouchEstimate, passed_s: float) -> TouchEstimate:
-    """One that a scan changed so that nothing explains it: that it is there, where roughly, and not how strongly.
+    """One that a scan changed so that nothing explains it, or that may be another one or several by now: that it is
+    there, where roughly, and not how strongly.
     passed_s: since it was said last.
     """
     covariance = touch.covariance.copy()

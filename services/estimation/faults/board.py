@@ -255,9 +255,8 @@ class BoardFaults:
         white = Whitening.of(covariance + self._any_touch)
         y = np.where(view.live, view.y - np.log1p(touched), 0.0)
         scan = Unexplained(y, np.ones_like(y), view.live, view.at.times_s, view.at.span_s, white)
-        return max(gain_change(scan, since_s).score for since_s in (-np.inf, gain_onset(scan))) + float(
-            n.LOG_PRIOR_GAIN
-        )
+        since = -np.inf, gain_onset(scan)
+        return float(n.LOG_PRIOR_GAIN) + max(gain_change(scan, since_s).score for since_s in since)
 
     def _untouched(self, view: BoardView) -> BoardScan:
         """As the wires are asked about it: what open electrodes explain tells nothing of the others' wires."""

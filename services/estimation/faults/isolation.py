@@ -40,9 +40,9 @@ class FaultIsolation:
         self._through: tuple[WireFault, Hypotheses] | None = None
 
     def __call__(
-        self, at: PredictedScan, innovation_of: MakeQuestion, answering: Selecting, recounting: Recounting
+        self, at: PredictedScan, innovation_of: MakeQuestion, selecting: Selecting, recounting: Recounting
     ) -> Explanation:
-        """innovation_of: of hypotheses, a view and a covariance; answering: the likeliest touches of an innovation;
+        """innovation_of: of hypotheses, a view and a covariance; selecting: the likeliest touches of an innovation;
         recounting: rather others than those of an answer.
         """
         faults = self._faults
@@ -58,7 +58,7 @@ class FaultIsolation:
         def asked(view: BoardView) -> Explanation:
             hypotheses = self._seen(view)
             innovation = innovation_of(hypotheses, view, view.covariance(skin, own))
-            return Explanation(view, innovation, recounting(hypotheses, innovation, answering(hypotheses, innovation)))
+            return Explanation(view, innovation, recounting(hypotheses, innovation, selecting(hypotheses, innovation)))
 
         view = faults.look(at)
         if faults.now.wire is None and rewired(view):
@@ -70,7 +70,7 @@ class FaultIsolation:
         if faults.now.opens and faults.now.wire is None and (odd or (at.whole and self._touches.in_doubt)):
             found = self._lifted(found, lambda: asked(faults.look(at)))
         if faults.asks(found.answer):
-            found = self._changed(found, at, *self._change(standing, at), answering)
+            found = self._changed(found, at, *self._change(standing, at), selecting)
         return self._doubted(found, at)
 
     def _lifted(self, found: Explanation, ask: Callable[[], Explanation]) -> Explanation:
@@ -87,7 +87,7 @@ class FaultIsolation:
         return found
 
     def _changed(
-        self, found: Explanation, at: PredictedScan, touched: Array, nearby: Array, answering: Selecting
+        self, found: Explanation, at: PredictedScan, touched: Array, nearby: Array, selecting: Selecting
     ) -> Explanation:
         hypotheses = self._seen(found.view)
 
@@ -95,7 +95,7 @@ class FaultIsolation:
         likely = () if fit is None else begun_as(fit, at.span_s)
 
         def ask(other: Innovation) -> ScoredAnswer:
-            return answering(hypotheses, replace(other, candidates=likely, places=found.answer.association))
+            return selecting(hypotheses, replace(other, candidates=likely, places=found.answer.association))
 
         if found.view.slopes is not None:
             touched = np.maximum(found.view.slopes @ touched, LEAST_MEAN)
