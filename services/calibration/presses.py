@@ -106,7 +106,7 @@ def _count(values: Mapping[str, NDArray[Any]], signal: tuple[str, ...], k: int) 
     if len(set(shapes)) > 1 or len(shapes[0]) != 2 or shapes[0][1] != k:
         found = " and ".join(f"{name} {shape}" for name, shape in zip(signal, shapes, strict=True))
         raise RegistrationError(f"{found}: expected (n, {k}), one row per press")
-    n = shapes[0][0]
+    n = int(shapes[0][0])
     if values["xy"].shape != (n, 2):
         raise RegistrationError(f"xy {values['xy'].shape}: expected ({n}, 2), metres")
     return n
