@@ -88,6 +88,16 @@ class TrackedTouch:
         return self.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1
 
     @property
+    def contact_due(self) -> bool:
+        """Whether it is time to ask if it is an electrode's contact impedance: while it is new, and now and then."""
+        return 0 < self.scans <= n.SURE_SCANS or self.doubt_due
+
+    @property
+    def weakened(self) -> bool:
+        """Whether it is weak, and has changed: it may have gone, and left something else."""
+        return self.z2 < n.DOUBT_Z2 and not self.still
+
+    @property
     def ended(self) -> bool:
         return self.until_s < np.inf
 
@@ -146,7 +156,7 @@ class TouchTracks:
     @property
     def in_doubt(self) -> bool:
         """Whether it is time to ask what stands, as is done now and then."""
-        return any(track.scans in n.CONTACT_DOUBTS or track.doubt_due for track in self.lasting)
+        return any(track.contact_due for track in self.lasting)
 
     @property
     def odd(self) -> bool:

@@ -208,6 +208,18 @@ def test_a_touch_right_on_an_electrode_is_no_drifting_contact(skin: StubSkin, to
     assert result.contact.valid and not result.contact.contacts
 
 
+@pytest.mark.parametrize(("electrode", "radius", "drop"), [(9, 0.12, 0.2), (9, 0.2, 0.1), (2, 0.16, 0.12)])
+def test_what_a_contact_that_drifted_under_a_light_touch_leaves_is_no_touch(skin, electrode, radius, drop) -> None:
+    """It rises by 10 % a second while 1 N presses beside it, and on when that has gone."""
+    touch = on_electrode(electrode, 0.12, 0.03, radius, drop)
+    risen = [(electrode, 1 + 0.1 * SCAN_S * k) for k in range(130)]
+    held = [skin.feel((touch,), (contact,)) for contact in risen[:90]]
+    after = [skin.feel((), (contact,)) for contact in risen[90:]]
+    assert all(len(present(r)) == 1 for r in held[-40:])
+    assert not any(r.contact.valid and present(r) for r in after[10:])
+    assert all(states(r) == {"drifting": [electrode]} for r in after[-20:])
+
+
 @pytest.mark.parametrize("snr_db", [70.0, 110.0])
 def test_no_touch_is_named_a_fault(snr_db: float) -> None:
     """On, beside and across electrodes, and anywhere; one to three at a time, on a skin that was free."""

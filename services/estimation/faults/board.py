@@ -284,11 +284,11 @@ class BoardFaults:
         return float(answer.weighted_residual.sum()) ** 2 / answer.information(even)
 
     def explained_by_fault(
-        self, without: Explanation, touched: Array, nearby: Array, ask: Ask, doubted: bool = False
+        self, without: Explanation, touched: Array, nearby: Array, ask: Ask, doubted: Array | None = None
     ) -> Explanation | None:
         """A contact or the gain that has changed, if that is likelier than what explains a scan without. touched (K,):
         relative change by touches that stand; nearby (K, K): covariance of what they may have changed by; ask: the
-        likeliest touches of an innovation. doubted: without one that stands and lies on an electrode.
+        likeliest touches of an innovation. doubted (7,): a touch that stands and lies on an electrode: without it.
         """
         view, innovation, answer = without.view, without.innovation, without.answer
         if innovation.budget.left <= 0:  # what is left open is asked again with the scans that follow
@@ -298,7 +298,7 @@ class BoardFaults:
             columns = columns.through(view.slopes)
         changes = self._likeliest(innovation, columns, any_touch, touched, nearby, unexplained=not answer.holds)
         innovation = replace(innovation, keeps=0.0)
-        best, least = None, answer.score + (n.LOG_PRIOR_TOUCH + n.LOG_PRIOR_SMALL if doubted else self._sure(answer))
+        best, least = None, answer.score + (self._sure(answer) if doubted is None else _log_prior_on_electrode(doubted))
         for k, change in enumerate(changes, 1):
             asked, column = self._with(innovation.leaving(1 - k / len(changes)), columns, change)
             found = ask(asked)
@@ -347,7 +347,7 @@ class BoardFaults:
         if answer.fit is None:
             return n.FAULT_SURE
         doubtful = [
-            place < 0 and self.on_electrode(state)
+            place < 0 and _small(state) and self.on_electrode(state)
             for state, place in zip(answer.fit.states, answer.association, strict=True)
         ]
         if any(doubtful):
@@ -355,9 +355,8 @@ class BoardFaults:
         return n.FAULT_SURE
 
     def on_electrode(self, state: Array) -> bool:
-        """Whether a touch (7,) is small and lies on an electrode."""
-        nearest = float(np.hypot(*(state[PLACE] - self._places).T).min())
-        return bool(state[LOG_RADIUS] < np.log(n.SMALL) and nearest < n.ON_ELECTRODE)
+        """Whether the middle of a touch (7,) lies on an electrode."""
+        return bool(np.hypot(*(state[PLACE] - self._places).T).min() < n.ON_ELECTRODE)
 
     def in_question(self, state: Array) -> bool:
         """Whether a touch (7,) lies on an electrode whose contact impedance has changed, or is the touch."""
@@ -581,6 +580,16 @@ class BoardFaults:
 def _told(column: Array, answer: ScoredAnswer) -> bool:
     """Whether an answer knows that there is a change; column (K,): of unit variance of what it may be."""
     return float(column @ answer.weighted_residual) ** 2 > n.ACTS_Z2 * max(1 - answer.information(column), 0.0)
+
+
+def _small(state: Array) -> bool:
+    """Whether a touch (7,) is as small as an electrode's contact impedance may look."""
+    return bool(state[LOG_RADIUS] < np.log(n.SMALL))
+
+
+def _log_prior_on_electrode(state: Array) -> float:
+    """Of a touch (7,) that lies on an electrode: small ones are seldom touches."""
+    return float(n.LOG_PRIOR_TOUCH + n.LOG_PRIOR_SMALL * _small(state))
 
 
 def _cost(change: Change) -> float:

@@ -13,7 +13,7 @@ from models.measurement.course import TouchCourse
 from models.measurement.covariance.noise import NoiseModel
 from models.measurement.fit import LEAST_MEAN
 from models.measurement.responses.tables import SkinTables
-from models.measurement.touch import ACTION, TouchPrior
+from models.measurement.touch import TouchPrior
 from services.estimation.faults.board import BoardFaults, BoardView, Explanation, PredictedScan, as_they_stand
 from services.estimation.faults.contact_or_touch import ContactOrTouchTest
 from services.estimation.faults.wires import WireFault
@@ -103,14 +103,13 @@ class FaultIsolation:
         return self._faults.explained_by_fault(found, touched, nearby, ask) or found
 
     def _doubted(self, found: Explanation, at: PredictedScan) -> Explanation:
-        """Is a touch on an electrode its contact impedance? Asked at some ages, when it has become weak, and when it
+        """Is a touch on an electrode its contact impedance? Asked at some ages, when a weak one changes, and when it
         does not plainly explain a scan: a contact that changes under a touch is left when the touch goes.
         """
         if self._faults.now.wire is not None or not at.whole:
             return found
         for k, track in enumerate(self._touches.now.tracks):
-            weak = track.state[ACTION] < n.WEAK * track.peak
-            asked = track.scans in n.CONTACT_DOUBTS or weak or _doubtful(found.answer)
+            asked = track.contact_due or track.weakened or _doubtful(found.answer)
             if track.told_from_contact and not _doubtful(found.answer):
                 continue
             if not asked or track.ended or not self._faults.on_electrode(track.state):
@@ -120,7 +119,7 @@ class FaultIsolation:
             del standing[k], loose[k]
             touched, nearby = self._change(standing, at, but=k)
             ask = partial(self._with, standing, loose)
-            other = self._faults.explained_by_fault(found, touched, nearby, ask, doubted=True)
+            other = self._faults.explained_by_fault(found, touched, nearby, ask, doubted=track.state)
             if other is not None:
                 self._touches.remove(k)
                 return other

@@ -255,9 +255,7 @@ SMALL = Number(0.2, "unit", "radius of a touch that may be an electrode's contac
 LOG_PRIOR_SMALL = Number(
     -8.0, "nat", "log prior of such a touch on an electrode", "derived: share of the sheet that it is"
 )
-CONTACT_DOUBTS = (1, 2, 8, 24, 72)  # whole scans of a touch on an electrode, at which it is asked whether it is one
 COUNT_DOUBTS = (2, 8, 24)  # whole scans of a touch, at which it is asked whether it is several
-WEAK = Number(0.3, "-", "of its greatest action, below which a touch on an electrode is doubted", "chosen: it goes")
 TOLD_BY = Number(24.0, "-", "measurements since a change began, at least", "derived: two parts; one is as well a touch")
 STANDS_WAY = Number(0.02, "unit", "way of a touch that stands, in a scan", "derived: 1 mm")
 STANDS_SHARE = Number(0.2, "-", "its change of size and of action", "derived: a finger that presses harder for a scan")
