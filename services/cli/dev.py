@@ -1,4 +1,6 @@
-"""`skin dev same`: does a change leave every frame as it was? For whoever works on a checkout."""
+"""`skin dev same`: does a change leave every frame as it was? `skin dev numbers`, `skin dev size`: how much there is to
+read of the estimator. For whoever works on a checkout.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
@@ -16,8 +19,9 @@ from services.cli.common import ROOT, USAGE, fail
 
 def register(app: typer.Typer) -> None:
     dev = typer.Typer(help="For whoever changes a checkout.", no_args_is_help=True)
-    dev.callback()(lambda: None)  # so that `same` stays a command of its own
     dev.command()(same)
+    dev.command()(numbers)
+    dev.command()(size)
     app.add_typer(dev, name="dev")
 
 
@@ -51,6 +55,30 @@ def same(
     print(scenes.digest([line for lines in found.values() for line in lines]), "in all")
     if differing:
         fail(f"{differing} of {len(found | others)} scenes differ")
+
+
+def numbers() -> None:
+    """Every number of the estimator that decides something: its tables, and literals elsewhere."""
+    from bench import estimator_size
+
+    found = estimator_size.numbers()
+    for each in found:
+        print(f"{each.where:58} {each.name:24} {each.value:<10g} {each.unit:8} {each.meaning}  [{each.origin}]")
+    kinds = Counter(each.kind for each in found)
+    print(", ".join(f"{count} {kind}" for kind, count in kinds.most_common()))
+
+
+def size() -> None:
+    """Lines, files and numbers of the estimator, and through how many files a scan runs."""
+    from bench import estimator_size as of
+
+    own, more = of.files(), of.files(of.HANGS_ON)
+    print(f"{of.lines(own)} lines in {len(own)} files of {' and '.join(of.AREAS)}")
+    print(f"{of.lines(own + more)} with stages, contacts, mounting, locator and response files")
+    print(f"{of.not_derived(of.numbers())} numbers that are not derived from others")
+    for scan, names in of.files_of_scans().items():
+        within = len(of.of_estimator(names))
+        print(f"a {scan} whole scan runs through {len(names)} files, {within} of them of the estimator")
 
 
 def _play(checkout: Path, out: Path, only: str) -> None:

@@ -30,6 +30,8 @@ USUAL = {  # what each command needs to run at all, where no service does; a fil
     "info": "none.mcap",
     "golden": "none.mcap",
     "dev same": "--against none",
+    "dev numbers": "",
+    "dev size": "",
     "export": "none.mcap --csv",
     "calibrate force": "--csv none.csv",
     "bridge": "pge",
