@@ -26,7 +26,6 @@ from services.estimation.images.operators import Operators
 from services.estimation.images.reconstruct import Reconstructed, Reconstruction
 from services.estimation.initialisation.baseline import TAKING, Baseline, NoBaseline, plausible_noise
 from services.estimation.initialisation.references import References
-from services.estimation.initialisation.tare import TareRefused
 from services.estimation.tared import KnownBaseline
 from services.estimation.values.estimate import Estimate, TouchEstimate
 from services.estimation.values.judgement import Judgement
@@ -332,7 +331,7 @@ class Preprocessing(Stage):
             return super().command(name, args)
         try:
             self.estimator.tare(bool(args.get("force", False)))
-        except TareRefused as why:
+        except NoBaseline as why:
             raise Refused(str(why)) from None
         self._trusted, self._undated_s = None, 0.0
         self._use(self._taken("command"))

@@ -31,11 +31,11 @@ from services.estimation.hypotheses.innovation import (
 )
 from services.estimation.hypotheses.observation import Observation, OpenTouch
 from services.estimation.hypotheses.selection import HypothesisSelection
+from services.estimation.initialisation.baseline import NoBaseline
 from services.estimation.initialisation.tare import (
     AgreedScans,
     BaselineTells,
     LatestScansState,
-    TareRefused,
     Taring,
     TaringState,
 )
@@ -99,11 +99,11 @@ class Estimator:
         self._information: GridInformation | None = None
 
     def tare(self, force: bool = False) -> AgreedScans:
-        """Take the latest scans for the untouched skin: these. Raises TareRefused, while something touches unless
+        """Take the latest scans for the untouched skin: these. Raises NoBaseline, while something touches unless
         forced.
         """
         if not force and self.wire is not None:
-            raise TareRefused("wires of the board are wrong, expected all as they belong: mend them and try again")
+            raise NoBaseline("wires of the board are wrong, expected all as they belong: mend them and try again")
         scans = self.taring.by_command(force, self._tells)
         self._begin(scans)
         return scans

@@ -25,7 +25,7 @@ LEAST_NOISE = 2e-6  # relative: about half a step of the board's 18 bits
 
 
 class NoBaseline(EitskinError, ValueError):
-    """Frames, or a saved state, do not make a baseline. The text says why and what to do."""
+    """Frames, or a saved state, make no baseline. The text says why and what to do; with ": wait", time alone helps."""
 
 
 @dataclass(frozen=True)
@@ -81,37 +81,43 @@ def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Bas
 
     A measurement that is not finite in every frame gets an infinite sigma: it is left out until the next tare.
     """
-    live = np.isfinite(frames).all(axis=0) & (frames > 0).all(axis=0)
-    if live.any():  # what is out of all proportion is no impedance of the same sheet
-        typical = float(np.median(frames[0, live]))
-        live &= (frames < OUT_OF_PROPORTION * typical).all(axis=0) & (frames > typical / OUT_OF_PROPORTION).all(axis=0)
-    if live.sum() < 0.5 * frames.shape[1]:
-        raise NoBaseline(
-            f"only {int(live.sum())} of {frames.shape[1]} measurements give values: check the cable and the electrodes"
-        )
-    good = frames[:, live]
-    mean = good.mean(axis=0)
-    noise = float(np.median(good.std(axis=0, ddof=1) / mean))
-    if noise > numbers.TARE_NOISY:
-        raise NoBaseline(
-            f"the frames scatter by {100 * noise:.1f} % (at most {100 * numbers.TARE_NOISY:.0f} %): "
-            "check grounding and cable"
-        )
-    if not (found := agreement(np.log(good))).holds:
+    log_z = np.log(np.where(frames > 0, frames, np.nan))
+    live, noise = measured(log_z)
+    if not (found := agreement(log_z[:, live])).holds:
         raise NoBaseline(str(found))
+    good = frames[:, live]
     z0, sigma = np.zeros(frames.shape[1]), np.full(frames.shape[1], np.inf)
-    z0[live], sigma[live] = mean, noise_of_frames(good, mean)
+    z0[live] = good.mean(axis=0)
+    sigma[live] = noise_of_frames(good, z0[live])
     sigma = plausible_noise(z0, sigma)
-    doubt = ""
-    if noise < numbers.TARE_IDENTICAL:
-        doubt = identical(len(frames))
-    share = float(np.median(sigma[live] / mean))
+    doubt = identical(len(frames)) if noise < numbers.TARE_IDENTICAL else ""
+    share = float(np.median(sigma[live] / z0[live]))
     if pre.m.normalisation == "model" and share > numbers.TARE_UNTRAINED:  # a measured bundle knows its own noise
         doubt = untrained(share)
     misfit = implausibility(z0, pre)
     if misfit > IMPLAUSIBLE:
         doubt = f"the baseline is {100 * misfit:.1f} % off what the bundle predicts: free the skin and run `skin tare`"
     return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
+
+
+def measured(log_z: Array) -> tuple[NDArray[np.bool_], float]:
+    """(K,) which measurements of (N, K) log |Z| every frame has, in some proportion to the others, and their relative
+    noise. Raises NoBaseline where those are too few, or scatter by too much.
+    """
+    live: NDArray[np.bool_] = np.asarray(np.isfinite(log_z).all(axis=0))
+    if live.any():  # what is out of all proportion is no impedance of the same sheet
+        live[live] = (np.abs(log_z[:, live] - np.median(log_z[0, live])) < np.log(OUT_OF_PROPORTION)).all(axis=0)
+    if live.mean() < numbers.LEAST_LIVE:
+        raise NoBaseline(
+            f"only {int(live.sum())} of {len(live)} measurements give values: check the cable and the electrodes"
+        )
+    noise = float(np.median(log_z[:, live].std(axis=0, ddof=1)))
+    if noise > numbers.TARE_NOISY:
+        raise NoBaseline(
+            f"the frames scatter by {100 * noise:.1f} % (at most {100 * numbers.TARE_NOISY:.0f} %): "
+            "check grounding and cable"
+        )
+    return live, noise
 
 
 def identical(count: int) -> str:

@@ -12,9 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.responses.tables import FIELD_DEGREES, SkinTables
-from protocol.errors import EitskinError
 from services.estimation.faults.wires import WireFault, WireKind
-from services.estimation.initialisation.baseline import LEAST_NOISE, agreement, identical, untrained
+from services.estimation.initialisation.baseline import (
+    LEAST_NOISE,
+    NoBaseline,
+    agreement,
+    identical,
+    measured,
+    untrained,
+)
 from services.estimation.initialisation.start import EarlierBaseline, JudgedStart, StartSays, TouchAtStartTest
 from services.estimation.initialisation.wiring import WiringTest
 from services.estimation.values import numbers as n
@@ -31,10 +37,6 @@ UNSURE = (
     "once"
 )
 PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare{}`"
-
-
-class TareRefused(EitskinError, ValueError):
-    """The latest scans make no baseline. The text says why and what to do; with ": wait" in it, time alone helps."""
 
 
 class BaselineTells(Enum):
@@ -123,30 +125,19 @@ class LatestScans:
         return scans.mean(axis=0), variance, live
 
     def agreed(self, tables: SkinTables, order: NDArray[np.intp] | None = None) -> AgreedScans:
-        """Raises TareRefused where there are too few, or they do not agree. order (K,): the value that each measurement
+        """Raises NoBaseline where there are too few, or they do not agree. order (K,): the value that each measurement
         would show if no wires were exchanged; None: its own.
         """
         needed = self.needed
         if len(self) < needed:
-            raise TareRefused(f"only {len(self)} of {needed} frames came so far: wait, or look at `skin top`")
+            raise NoBaseline(f"only {len(self)} of {needed} frames came so far: wait, or look at `skin top`")
         scans = np.stack(self.now.log_z)
         scans = scans if order is None else scans[:, order]
-        live: NDArray[np.bool_] = np.asarray(np.isfinite(scans).all(axis=0))
-        if live.mean() < n.LEAST_LIVE:
-            raise TareRefused(
-                f"only {int(live.sum())} of {len(live)} measurements give values: check the cable and the electrodes"
-            )
-        good = scans[:, live]
-        noise = float(np.median(good.std(axis=0, ddof=1)))
-        if noise > n.TARE_NOISY:
-            raise TareRefused(
-                f"the frames scatter by {100 * noise:.1f} % (at most {100 * n.TARE_NOISY:.0f} %): check grounding and "
-                "cable"
-            )
+        live, noise = measured(scans)
         slopes = np.array(FIELD_DEGREES) <= 1
-        found = agreement(without_drift(good, tables.field[np.ix_(live, slopes)]))
+        found = agreement(without_drift(scans[:, live], tables.field[np.ix_(live, slopes)]))
         if not found.holds:
-            raise TareRefused(str(found))
+            raise NoBaseline(str(found))
         judgements = [judge("agrees", *found), judge("identical", n.TARE_IDENTICAL, max(noise, 1e-300))]
         if tables.predicted:  # a measured bundle knows its own noise
             judgements.append(judge("noise_trained", noise, n.TARE_UNTRAINED))
@@ -239,7 +230,7 @@ class Taring:
             return None
         try:
             scans = self.latest.agreed(self._tables, None if wire is None else self._wires.maps.order(wire))
-        except TareRefused as why:
+        except NoBaseline as why:
             self.now.problem = f"no baseline yet: {why}"
             return None
         start = self._judged(scans, earlier)
@@ -256,20 +247,20 @@ class Taring:
         return self._start(scans.log_z0, variance, scans.live, earlier)
 
     def by_command(self, force: bool, tells: BaselineTells) -> AgreedScans:
-        """The latest scans, whatever the baseline was. Raises TareRefused, while something touches unless forced."""
+        """The latest scans, whatever the baseline was. Raises NoBaseline, while something touches unless forced."""
         now, needed = self.now, self.latest.needed
         if now.surely and not force:
-            raise TareRefused(PRESSED.format(" --force"))
+            raise NoBaseline(PRESSED.format(" --force"))
         believed = tells is BaselineTells.TOUCHES and not now.doubted
         if believed and not force and len(self.latest) == needed:
             if now.touched:
-                raise TareRefused("the skin is touched: free it and try again (or --force, if nothing touches it)")
+                raise NoBaseline("the skin is touched: free it and try again (or --force, if nothing touches it)")
             if now.untouched < needed:
                 few = f"only {now.untouched} of {needed} untouched frames since the last touch"
-                raise TareRefused(f"{few}: wait and try again")
+                raise NoBaseline(f"{few}: wait and try again")
         scans = self.latest.agreed(self._tables)
         if tells is BaselineTells.LOST and not force and self._judged(scans, None).sure:
-            raise TareRefused(PRESSED.format(" --force"))
+            raise NoBaseline(PRESSED.format(" --force"))
         # Whoever gives the command has looked: no doubt, but that of noise, which looking does not mend.
         now.judgements = tuple(each for each in scans.judgements if each.name != "identical")
         self._taken(scans, None)
