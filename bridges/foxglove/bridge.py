@@ -11,8 +11,8 @@ from foxglove import Capability, Context
 
 from bridges.clock import WallClock
 from bridges.door import Door, kept_token
-from bridges.feeds import ContactFeed, ImageFeed, Measured, NewestFeed, Refusal
 from bridges.process import Bridge, BridgedSkin, BridgeError, Handed, openable
+from protocol.feeds import ContactFeed, ImageFeed, Measured, NewestFeed, Refusal
 from protocol.frames import InfoFrame, ShapeFrame
 from protocol.sockets import AllReader
 from protocol.transport import Socket

@@ -3,7 +3,7 @@
 import pytest
 
 from bridges.clock import WallClock
-from bridges.feeds import ContactPace, Measured
+from protocol.feeds import ContactPace, Measured
 from protocol.frames import Contact, ContactFrame
 
 PART_NS = 4_358_000  # of a scan in parts

@@ -10,6 +10,7 @@ from typing import Any
 from eitskin import views
 from eitskin.control import ControlClient, ControlError
 from eitskin.errors import EitskinError
+from eitskin.feeds import ContactPace, Measured
 from eitskin.frames import ContactFrame, ImageFrame, StatusFrame
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.duration import Duration
@@ -60,8 +61,7 @@ class SkinNode(Node):
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._tf = self.create_publisher(ros.TFMessage, "/tf_static", latched)
         self._frame_id = self.skin  # until a frame says
-        self._marker_s = 1 / given["marker_rate"]
-        self._marked: tuple[float, frozenset[int]] = 0.0, frozenset()  # when, and which contacts
+        self._marker_pace = ContactPace(given["marker_rate"])
         self._state: tuple[bool, list[str]] | None = None  # valid and reasons of what was published last
         self._pose: Any = None
         if given["tare"]:
@@ -96,9 +96,7 @@ class SkinNode(Node):
         _publish(self._contacts, lambda: messages.contacts(self._ros, head, frame))
         if views.has_forces(frame):
             _publish(self._wrench, lambda: messages.wrench(self._ros, head, frame))
-        now, ids = time.monotonic(), frozenset(contact.id for contact in frame.contacts)
-        if ids != self._marked[1] or now - self._marked[0] >= self._marker_s:
-            self._marked = now, ids
+        if self._marker_pace.passes(Measured(frame, measured_ns)):
             _publish(self._markers, lambda: messages.markers(self._ros, head, frame))
 
     def refuse(self, why: str, reasons: list[str], measured_ns: int | None = None) -> None:
@@ -107,7 +105,7 @@ class SkinNode(Node):
         head = self._header(measured_ns or time.monotonic_ns())
         _publish(self._contacts, lambda: messages.not_valid(self._ros, head, reasons))
         _publish(self._markers, lambda: messages.markers(self._ros, head, None))
-        self._marked = 0.0, frozenset()
+        self._marker_pace.refused()
 
     def show(self, frame: ImageFrame, measured_ns: int) -> None:
         """Publish an image that may be shown as the present one."""

@@ -10,12 +10,10 @@ import traceback
 
 import rclpy
 import zmq
-from eitskin.ages import Ages
-from eitskin.frames import ELECTRODE_STATES, DeltaFrame, ImageFrame, InfoFrame, StatusFrame
+from eitskin.feeds import ImageFeed, NewestFeed
+from eitskin.frames import ELECTRODE_STATES, DeltaFrame, InfoFrame, StatusFrame
 from eitskin.freshness import NewestContacts, NotValid
-from eitskin.held import HeldImage
-from eitskin.runtime import host_id
-from eitskin.sockets import AllReader, NewestReader
+from eitskin.sockets import AllReader
 
 from .messages import SILENT
 from .node import SkinNode
@@ -49,21 +47,23 @@ class ReaderThread:
                 rclpy.try_shutdown()
 
     def _read(self) -> None:
-        contacts, images, statuses = Contacts(self._node), Images(self._node), Statuses(self._node)
+        node = self._node
+        contacts, images, statuses = Contacts(node), ImageFeed(node.skin, node.replay), Statuses(node)
         next_tick = 0.0
         while not self._closing.is_set():
             poller = zmq.Poller()
-            for reader in (contacts.reader, statuses.reader, *images.readers):
-                poller.register(reader.socket, zmq.POLLIN)
+            for socket in (contacts.reader.socket, statuses.reader.socket, *images.sockets()):
+                poller.register(socket, zmq.POLLIN)
             since_ns = time.monotonic_ns()
             ready = dict(poller.poll(max(0.0, min(next_tick, contacts.due) - since_ns * 1e-9) * 1000))
             contacts.take(since_ns, contacts.reader.socket in ready)
-            images.take(since_ns)
+            if (picture := images.take(since_ns)) is not None:
+                node.show(picture.frame, picture.measured_ns)
             statuses.take()
             if time.monotonic() >= next_tick:
                 next_tick = time.monotonic() + TICK_S
                 contacts.reader.mind()
-                images.look()
+                images.want(node.wants_image)
                 statuses.look()
 
 
@@ -95,36 +95,6 @@ class Contacts:
             self.due = time.monotonic() + TICK_S
 
 
-class Images:
-    """`readers`: one while somebody wants images, else none. A held image is put in again."""
-
-    def __init__(self, node: SkinNode) -> None:
-        self._node = node
-        self.readers: list[NewestReader] = []
-        self._ages, self._held = Ages(), HeldImage()
-
-    def look(self) -> None:
-        """Subscribe while somebody wants images."""
-        if self._node.wants_image and not self.readers:
-            self.readers = [NewestReader("image", self._node.skin)]
-        elif not self._node.wants_image and self.readers:
-            self.readers.pop().close()
-        for reader in self.readers:
-            reader.mind()
-
-    def take(self, since_ns: int) -> None:
-        """One of another host has come since `since_ns`, and more is not known."""
-        frame = self.readers[0].recv(0.0) if self.readers else None
-        if not isinstance(frame, ImageFrame) or (frame.source == "replay" and not self._node.replay):
-            return
-        here = frame.host in ("", host_id())
-        measured_ns = self._ages.measured_ns(frame, time.monotonic_ns() if here else since_ns)
-        if not self._held.complete(frame):
-            self.readers.pop().close()  # whoever subscribes is sent it
-        elif frame.valid and measured_ns is not None and self._ages.age_s(measured_ns) <= frame.valid_for_s:
-            self._node.show(frame, measured_ns)
-
-
 class Statuses:
     """What eitskin's processes say of themselves, and where the skin is."""
 
@@ -132,7 +102,7 @@ class Statuses:
         self._node = node
         self.reader = AllReader(["status", "info"], node.skin)
         self._statuses: dict[str, tuple[StatusFrame, float]] = {}
-        self._scans: NewestReader | None = None  # which say how the electrodes are
+        self._scans = NewestFeed("delta", node.skin)  # which say how the electrodes are
         self._next = 0.0
 
     def take(self) -> None:
@@ -145,13 +115,12 @@ class Statuses:
     def look(self) -> None:
         """Publish diagnostics, where they are wanted and due."""
         self.reader.mind()
-        if not self._node.wants_diagnostics or time.monotonic() < self._next:
+        wanted = self._node.wants_diagnostics
+        self._scans.want(wanted)
+        if not wanted or time.monotonic() < self._next:
             return
         self._next = time.monotonic() + DIAGNOSTICS_S
-        if self._scans is None:
-            self._scans = NewestReader("delta", self._node.skin)
-        self._scans.mind()
-        scan = self._scans.recv(0.0)
+        scan = self._scans.recv()
         states = scan.electrodes.tolist() if isinstance(scan, DeltaFrame) else []
         electrodes = [ELECTRODE_STATES[s] if s < len(ELECTRODE_STATES) else "unknown" for s in states]
         now = time.monotonic()

@@ -8,14 +8,14 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from protocol.ages import Ages
-from protocol.frames import ContactFrame, Frame, ImageFrame
-from protocol.freshness import NewestContacts, NotValid, Stale
-from protocol.held import HeldImage
-from protocol.runtime import host_id
-from protocol.sockets import NewestReader
-from protocol.topics import wire_topic
-from protocol.transport import Socket
+from .ages import Ages
+from .frames import ContactFrame, Frame, ImageFrame
+from .freshness import NewestContacts, NotValid, Stale
+from .held import HeldImage
+from .runtime import host_id
+from .sockets import NewestReader
+from .topics import wire_topic
+from .transport import Socket
 
 
 @dataclass(frozen=True)
