@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-from protocol.frames import ContactFrame, Frame, ImageFrame
+from protocol.frames import Frame, ImageFrame
 from protocol.held import HeldImage
 
 Logged = tuple[int, Frame]
@@ -40,8 +40,3 @@ def timed(read: Callable[[], Iterable[Logged]]) -> Iterator[Entry]:
         sample = frame.stamps.get("sample")
         known = sample is not None and frame.source != "replay" and frame.host in ahead
         yield Entry(sample + ahead[frame.host] if known and sample is not None else logged_ns, frame)
-
-
-def frame_id(frame: Frame) -> str:
-    """The coordinate frame of a skin's contacts."""
-    return (frame.frame_id if isinstance(frame, ContactFrame) else "") or frame.skin

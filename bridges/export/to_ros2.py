@@ -20,7 +20,7 @@ from bridges.ros2.eitskin_ros.eitskin_ros import messages
 from protocol import views
 from protocol.frames import ContactFrame, ImageFrame, InfoFrame, StatusFrame
 
-from .entries import Entry, frame_id
+from .entries import Entry
 
 DEFINITIONS = Path(__file__).parents[1] / "ros2" / "eitskin_msgs" / "msg"
 BEST_EFFORT = ("eitskin_msgs/msg/ContactArray", "sensor_msgs/msg/PointCloud2")
@@ -45,12 +45,15 @@ class _Bag:
         self._writer, self._store = writer, typestore()
         self._ros = messages.message_types(lambda of, name: partial(_message, self._store, f"{of}/msg/{name}"))
         self._connections: dict[str, Any] = {}
+        self._infos: dict[str, dict[str, Any]] = {}  # by skin
         self.counts: Counter[str] = Counter()
 
     def put(self, entry: Entry) -> None:
         """Write what the node would have published of a frame."""
         frame, ros, base = entry.frame, self._ros, f"/{messages.ros_name(entry.skin)}"
-        head = messages.header(ros, entry.ns, frame_id(frame))
+        info = self._infos.get(entry.skin, {})
+        of_contacts = frame.frame_id if isinstance(frame, ContactFrame) else ""
+        head = messages.header(ros, entry.ns, of_contacts or info.get("frame_id") or entry.skin)
         found: dict[str, Any] = {}
         if isinstance(frame, ContactFrame):
             found[f"{base}/contacts"] = messages.contacts(ros, head, frame)
@@ -58,13 +61,15 @@ class _Bag:
             if frame.valid and views.has_forces(frame):
                 found[f"{base}/wrench"] = messages.wrench(ros, head, frame)
         elif isinstance(frame, ImageFrame) and frame.valid:
-            found[f"{base}/conductivity_drop"] = messages.conductivity_drop(ros, head, frame)
+            found[f"{base}/conductivity_drop"] = messages.conductivity_drop(ros, head, frame, info.get("surface"))
             found[f"{base}/image"] = messages.image(ros, head, frame)
         elif isinstance(frame, StatusFrame):
             of = messages.of_process(ros, frame, 0.0)
             found["/diagnostics"] = ros.DiagnosticArray(header=messages.header(ros, entry.ns, ""), status=[of])
-        elif isinstance(frame, InfoFrame) and (moved := messages.transform(ros, entry.ns, frame.info)) is not None:
-            found["/tf_static"] = moved
+        elif isinstance(frame, InfoFrame):
+            self._infos[entry.skin] = frame.info
+            if (moved := messages.transform(ros, entry.ns, frame.info)) is not None:
+                found["/tf_static"] = moved
         for topic, message in found.items():
             self._write(topic, entry.ns, message)
 

@@ -41,7 +41,7 @@ def frames() -> Iterator[tuple[int, Frame]]:
         shown = np.zeros((0, 0), "<f4") if held or k < 2 else drop_image()
         grid: dict[str, Any] = {"metres_per_pixel": 0.01, "origin": [-0.04, -0.04], "reconstructed": min(100 + k, 106)}
         yield at, ImageFrame(**head, **grid, touched=k >= 2, held=held, image=shown)
-        yield at, ContactFrame(**head, frame_id="palm", contacts=contacts, held=held)
+        yield at, ContactFrame(**head, frame_id="wrist", contacts=contacts, held=held)
         shape: dict[str, Any] = {"outlines": [SQUARE], "orientation": [0.0], "probabilities": [[0.2] * 5]}
         if contacts:
             yield at, ShapeFrame(**head, **shape, ids=[7])
@@ -76,6 +76,8 @@ def test_ros2_is_read_by_another_reader_and_has_the_nodes_topics(skin, recording
     peaks = [np.float32(0.3) if k >= 2 else 0.0 for k in VALID]
     assert [float(points[:, 3].max()) for points in clouds] == peaks, "a held image is written again"
     assert [tf.transforms[0].child_frame_id for tf in of["/tf_static"]] == ["palm"]
+    frame_ids = {of[f"/palm/{topic}"][0].header.frame_id for topic in ("contacts", "wrench")}
+    assert frame_ids == {"wrist"} and of["/palm/image"][0].header.frame_id == "palm", "contacts_in may be the parent"
     assert of["/diagnostics"][0].status[0].message == "slow"
     with open(out, "rb") as file:
         summary = make_reader(file).get_summary()

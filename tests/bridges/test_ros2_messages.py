@@ -13,6 +13,7 @@ import pytest
 from bridges.export.to_ros2 import DEFINITIONS, _message, typestore
 from bridges.ros2.eitskin_ros.eitskin_ros import messages
 from protocol.frames import Contact, ContactFrame, ImageFrame, StatusFrame
+from services.contacts.surface import Cylinder
 from tests.bridges.conftest import PLACED
 
 STORE = typestore()
@@ -42,8 +43,8 @@ def test_the_definitions_are_documented_and_depend_on_what_their_package_names()
         text = file.read_text()
         assert f'"msg/{file.name}"' in cmake and text.startswith("# ")
         assert all(part.startswith("# ") for part in text.split("\n\n")), f"a field of {file.name} says nothing"
-        for of in set(re.findall(r"^(\w+)/", text, re.MULTILINE)):
-            assert f"find_package({of} REQUIRED)" in cmake and f"<depend>{of}</depend>" in package
+        for name in set(re.findall(r"^(\w+)/", text, re.MULTILINE)):
+            assert f"find_package({name} REQUIRED)" in cmake and f"<depend>{name}</depend>" in package
 
 
 def test_contacts_carry_all_that_is_known_and_nothing_where_they_are_not_valid() -> None:
@@ -96,11 +97,16 @@ def test_cloud_and_image_say_the_same() -> None:
     drop[1, 4] = 0.5
     grid: dict[str, Any] = {"skin": "palm", "metres_per_pixel": 0.01, "origin": [-0.03, -0.02]}
     frame, untouched = ImageFrame(**grid, touched=True, image=drop, sigma=drop + 0.1), ImageFrame(**grid)
-    cloud, empty = (read(messages.conductivity_drop(ROS, HEAD, each)) for each in (frame, untouched))
+    cloud, empty = (read(messages.conductivity_drop(ROS, HEAD, each, None)) for each in (frame, untouched))
     points, none = (np.frombuffer(each.data.tobytes(), "<f4").reshape(-1, 5) for each in (cloud, empty))
     assert [field.name for field in cloud.fields] == ["x", "y", "z", "conductivity_drop", "sigma"] and cloud.width == 24
     assert points[points[:, 3].argmax()] == pytest.approx([0.015, -0.005, 0, 0.5, 0.6])
     assert len(none) == 24 and not none[:, 3].any() and np.isnan(none[:, 4]).all() and not empty.is_dense
+    wrapped: dict[str, Any] = {"kind": "cylinder", "radius_m": 0.03, "axis_degrees": 20.0}
+    bent = read(messages.conductivity_drop(ROS, HEAD, frame, wrapped))
+    places = np.frombuffer(bent.data.tobytes(), "<f4").reshape(-1, 5)[:, :3]
+    on = Cylinder(0.03, math.radians(20.0))
+    assert places == pytest.approx(np.array([on(*p).point for p in points[:, :2].astype(float)]), abs=1e-7)
     image = read(messages.image(ROS, HEAD, frame))
     pixels = np.frombuffer(image.data.tobytes(), "<f4").reshape(image.height, image.width)
     assert image.encoding == "32FC1" and pixels[4 - 1 - 1, 4] == np.float32(0.5)  # row 0 is the highest y

@@ -113,7 +113,7 @@ def test_an_exported_recording_is_played_to_a_stranger(heard: Heard, tmp_path: P
         played = [(s.name, m.data) for s, c, m in make_reader(file).iter_messages() if c.topic == "/palm/contacts"]
     heard.until("contacts", lambda c: c[:2] == [False, ["silent"]])
     heard.order("play", "/bag/contacts", played[3][0], base64.b64encode(played[3][1]).decode())
-    assert heard.until("/bag/contacts") == [True, [], [[7, 3.0, 0.02, 0.01]], "palm"]
+    assert heard.until("/bag/contacts") == [True, [], [[7, 3.0, 0.02, 0.01]], "wrist"]
 
 
 def test_a_press_of_the_stub_is_heard_in_newtons_and_metres(heard: Heard, runtime: Path) -> None:

@@ -145,15 +145,18 @@ def markers(ros: Any, head: Any, frame: Any) -> Any:
     return ros.MarkerArray(markers=found)
 
 
-def conductivity_drop(ros: Any, head: Any, frame: Any) -> Any:
-    """PointCloud2: a point for each pixel, with the conductivity drop and its standard uncertainty [S/m]."""
+def conductivity_drop(ros: Any, head: Any, frame: Any, surface: Any) -> Any:
+    """PointCloud2: a point for each pixel, with the conductivity drop and its standard uncertainty [S/m].
+
+    `surface`: what the sheet is wrapped round, as info says; None where it lies flat.
+    """
     drop, sigma = views.filled(frame)
     rows, columns = drop.shape
     names = ("x", "y", "z", "conductivity_drop", "sigma")
     points = np.zeros((rows, columns, len(names)), "<f4")
     m, (x0, y0) = frame.metres_per_pixel, frame.origin
-    points[..., 0] = x0 + (np.arange(columns) + 0.5) * m
-    points[..., 1] = (y0 + (np.arange(rows) + 0.5) * m)[:, None]
+    x, y = x0 + (np.arange(columns) + 0.5) * m, (y0 + (np.arange(rows) + 0.5) * m)[:, None]
+    points[..., 0], points[..., 1], points[..., 2] = _wrapped(x, y, surface) if surface else (x, y, 0.0)
     points[..., 3], points[..., 4] = drop, sigma
     return ros.PointCloud2(
         header=head,
@@ -165,6 +168,15 @@ def conductivity_drop(ros: Any, head: Any, frame: Any) -> Any:
         data=array.array("B", points.tobytes()),
         is_dense=bool(np.isfinite(sigma).all()),
     )
+
+
+def _wrapped(x: Any, y: Any, surface: Mapping[str, float]) -> tuple[Any, Any, Any]:
+    """Where points of the sheet are on the outside of a cylinder, whose axis lies below the sheet's centre."""
+    r, axis = surface["radius_m"], math.radians(surface["axis_degrees"])
+    cos, sin = math.cos(axis), math.sin(axis)
+    along, angle = cos * x + sin * y, (sin * x - cos * y) / r
+    across = r * np.sin(angle)
+    return along * cos + across * sin, along * sin - across * cos, r * (np.cos(angle) - 1)
 
 
 def image(ros: Any, head: Any, frame: Any) -> Any:

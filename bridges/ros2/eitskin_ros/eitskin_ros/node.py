@@ -60,10 +60,10 @@ class SkinNode(Node):
         self._diagnostics = self.create_publisher(ros.DiagnosticArray, "/diagnostics", 10)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._tf = self.create_publisher(ros.TFMessage, "/tf_static", latched)
-        self._frame_id = self.skin  # until a frame says
+        self._frame_id = self.skin  # of contacts, which may be given in the parent's frame; until a frame says
         self._marker_pace = ContactPace(given["marker_rate"])
         self._state: tuple[bool, list[str]] | None = None  # valid and reasons of what was published last
-        self._pose: Any = None
+        self._info: dict[str, Any] = {}
         if given["tare"]:
             self.create_service(Trigger, "~/tare", self._on_tare)
         if given["reference_topic"]:
@@ -92,7 +92,7 @@ class SkinNode(Node):
         """Publish contacts that may be acted on. `measured_ns`: by the monotonic clock of this host."""
         self._note(True, frame.reasons, "valid")
         self._frame_id = frame.frame_id or self.skin
-        head = self._header(measured_ns)
+        head = self._header(measured_ns, self._frame_id)
         _publish(self._contacts, lambda: messages.contacts(self._ros, head, frame))
         if views.has_forces(frame):
             _publish(self._wrench, lambda: messages.wrench(self._ros, head, frame))
@@ -102,22 +102,23 @@ class SkinNode(Node):
     def refuse(self, why: str, reasons: list[str], measured_ns: int | None = None) -> None:
         """Say that nothing may be acted on: of a measurement, or that none has come. `why`: for the log."""
         self._note(False, reasons, why)
-        head = self._header(measured_ns or time.monotonic_ns())
+        head = self._header(measured_ns or time.monotonic_ns(), self._frame_id)
         _publish(self._contacts, lambda: messages.not_valid(self._ros, head, reasons))
         _publish(self._markers, lambda: messages.markers(self._ros, head, None))
         self._marker_pace.refused()
 
     def show(self, frame: ImageFrame, measured_ns: int) -> None:
         """Publish an image that may be shown as the present one."""
-        head = self._header(measured_ns)
-        _publish(self._drop, lambda: messages.conductivity_drop(self._ros, head, frame))
+        head = self._header(measured_ns, self._info.get("frame_id") or self.skin)
+        surface = self._info.get("surface")
+        _publish(self._drop, lambda: messages.conductivity_drop(self._ros, head, frame, surface))
         _publish(self._image, lambda: messages.image(self._ros, head, frame))
 
     def place(self, info: dict[str, Any]) -> None:
         """Publish where the skin is; again only where it is elsewhere."""
-        known = [info.get(key) for key in ("pose", "parent_frame_id", "frame_id")]
-        if known != self._pose and (moved := messages.transform(self._ros, time.time_ns(), info)) is not None:
-            self._pose = known
+        known, self._info = self._info, info
+        same = all(known.get(key) == info.get(key) for key in ("pose", "parent_frame_id", "frame_id"))
+        if not same and (moved := messages.transform(self._ros, time.time_ns(), info)) is not None:
             self._tf.publish(moved)
 
     def diagnose(self, processes: Iterable[tuple[StatusFrame, float]], electrodes: list[str]) -> None:
@@ -131,9 +132,9 @@ class SkinNode(Node):
         found.append(messages.diagnostic(ros, self.skin, "contacts", level, text, {}))
         self._diagnostics.publish(ros.DiagnosticArray(header=messages.header(ros, time.time_ns(), ""), status=found))
 
-    def _header(self, measured_ns: int) -> Any:
+    def _header(self, measured_ns: int, frame_id: str) -> Any:
         ahead_ns = time.time_ns() - time.monotonic_ns()  # each time: the system's time is set now and then
-        return messages.header(self._ros, measured_ns + ahead_ns, self._frame_id)
+        return messages.header(self._ros, measured_ns + ahead_ns, frame_id)
 
     def _note(self, valid: bool, reasons: list[str], said: str) -> None:
         """For diagnostics, and for the log where it is news."""
