@@ -15,6 +15,7 @@ from bridges.ros2.eitskin_ros.eitskin_ros import messages
 from protocol.frames import Contact, ContactFrame, ImageFrame, StatusFrame
 from services.contacts.surface import Cylinder
 from tests.bridges.conftest import PLACED
+from tests.test_architecture import of
 
 STORE = typestore()
 ROS = messages.message_types(lambda of, name: partial(_message, STORE, f"{of}/msg/{name}"))
@@ -45,6 +46,13 @@ def test_the_definitions_are_documented_and_depend_on_what_their_package_names()
         assert all(part.startswith("# ") for part in text.split("\n\n")), f"a field of {file.name} says nothing"
         for name in set(re.findall(r"^(\w+)/", text, re.MULTILINE)):
             assert f"find_package({name} REQUIRED)" in cmake and f"<depend>{name}</depend>" in package
+
+
+def test_the_node_s_package_names_what_it_imports() -> None:
+    package = (DEFINITIONS.parents[1] / "eitskin_ros" / "package.xml").read_text()
+    needs = set(re.findall(r"<exec_depend>(\w+)</exec_depend>", package))
+    imported = {name for each in of("bridges.ros2").values() for name in each.outside()}
+    assert needs == imported - {"eitskin", "eitskin_ros", "numpy", "setuptools", "zmq"} | messages.TYPES.keys()
 
 
 def test_contacts_carry_all_that_is_known_and_nothing_where_they_are_not_valid() -> None:

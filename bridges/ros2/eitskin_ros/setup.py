@@ -10,7 +10,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/eitskin_ros"]),
         (SHARE, ["package.xml"]),
-        *((f"{SHARE}/{folder}", glob(f"{folder}/*")) for folder in ("launch", "rviz", "urdf")),
+        *((f"{SHARE}/{folder}", glob(f"{folder}/*.*")) for folder in ("launch", "rviz", "urdf")),
     ],
     license="Apache-2.0",
     entry_points={"console_scripts": ["skin = eitskin_ros.main:main", "admittance = eitskin_ros.admittance:main"]},

@@ -19,7 +19,7 @@ def nodes(context):
             parameters=[{"skin": skin}, *files],
             output="screen",
         )
-        for skin in given["skins"].split(",")
+        for skin in given["skins"].replace(",", " ").split()
     ]
 
 
