@@ -10,6 +10,7 @@ import traceback
 
 import rclpy
 import zmq
+from eitskin.errors import EitskinError
 from eitskin.feeds import ImageFeed, NewestFeed
 from eitskin.frames import ELECTRODE_STATES, DeltaFrame, InfoFrame, StatusFrame
 from eitskin.freshness import NewestContacts, NotValid
@@ -40,10 +41,10 @@ class ReaderThread:
     def _run(self) -> None:
         try:
             self._read()
-        except Exception:
+        except Exception as why:
             if rclpy.ok():  # else Ctrl-C ended it, and what is published fails
                 self.failed = True
-                self._node.get_logger().fatal(traceback.format_exc())
+                self._node.get_logger().fatal(str(why) if isinstance(why, EitskinError) else traceback.format_exc())
                 rclpy.try_shutdown()
 
     def _read(self) -> None:
