@@ -31,7 +31,9 @@ def drop_image() -> np.ndarray:
 
 
 class FakeService:
-    """Publishes contacts and images of `palm` every `every_s`, one touch of 3 N at (0.02, 0), until told otherwise."""
+    """Publishes contacts and images of `palm` every `every_s`, one touch of 3 N at (0.02, 0), until told otherwise; and
+    contacts of `sole`, which nothing touches.
+    """
 
     def __init__(self) -> None:
         self.valid, self.silent, self.every_s, self.contact, self.scan = True, False, 0.04, 1, 0
@@ -69,6 +71,7 @@ class FakeService:
         touch.wrench = [0, 0, -3.0, 0, 0.06, 0]
         shape: dict[str, Any] = {"outlines": [SQUARE], "orientation": [0.0], "probabilities": [[0.2] * 5]}
         publisher.send(ContactFrame(**head, frame_id="palm", contacts=[touch]))
+        publisher.send(ContactFrame(**head | {"skin": "sole"}, frame_id="sole"))
         publisher.send(ShapeFrame(**head, **shape, ids=[touch.id]))
         grid: dict[str, Any] = {"metres_per_pixel": 0.01, "origin": [-0.04, -0.04]}
         inference.send(ImageFrame(**head, **grid, touched=True, image=drop_image()))

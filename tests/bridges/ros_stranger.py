@@ -1,7 +1,7 @@
 """A ROS node of somebody else, for test_ros2_node.py: it knows eitskin by its messages alone, and prints what it hears.
 
-A line on its input: `tell`, of parameters and publishers; `tare`; `press N`, as the robot's force-torque sensor; or
-`play TOPIC TYPE BASE64`, a message of a bag.
+A line on its input: `tell`, of parameters and publishers; `tare`; `press N`, as the robot's force-torque sensor; `play
+TOPIC TYPE BASE64`, a message of a bag; or `bag START N`, 0.3 s of a bag's time and of its wrenches, where N is not 0.
 """
 
 import base64
@@ -10,14 +10,17 @@ import json
 import struct
 import sys
 import threading
+import time
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from eitskin_msgs.msg import ContactArray
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import TwistStamped, WrenchStamped
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, PointCloud2
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
@@ -45,6 +48,8 @@ TOPICS = {
     "/diagnostics": (DiagnosticArray, lambda m: {s.name: [ord(s.level), s.message] for s in m.status}, 10),
     "/tf_static": (TFMessage, lambda m: [[t.header.frame_id, t.child_frame_id] for t in m.transforms], LATCHED),
     "/bag/contacts": (ContactArray, contacts, qos_profile_sensor_data),
+    "/right/sole/contacts": (ContactArray, contacts, qos_profile_sensor_data),
+    "/bag/twist": (TwistStamped, lambda m: m.twist.linear.z, 10),
 }
 
 
@@ -76,6 +81,23 @@ def tell():
     call(SetParameters, "set_parameters", simulated, lambda a: [[r.successful, r.reason] for r in a.results])
 
 
+def wrench(force, seconds=0.0):
+    message = WrenchStamped()
+    message.header.stamp = Time(seconds=seconds).to_msg()
+    message.wrench.force.z = -force
+    return message
+
+
+def bag(start, force):
+    while not (clock.get_subscription_count() and bagged.get_subscription_count()):
+        time.sleep(0.01)
+    for k in range(30):
+        clock.publish(Clock(clock=Time(seconds=start + 0.01 * k).to_msg()))
+        if force:
+            bagged.publish(wrench(force, start + 0.01 * k))
+        time.sleep(0.01)
+
+
 def orders():
     for word, *rest in map(str.split, sys.stdin):
         if word == "tell":
@@ -83,9 +105,9 @@ def orders():
         elif word == "tare":
             call(Trigger, "tare", Trigger.Request(), lambda answer: [answer.success, answer.message])
         elif word == "press":
-            message = WrenchStamped()
-            message.wrench.force.z = -float(rest[0])
-            sensor.publish(message)
+            sensor.publish(wrench(float(rest[0])))
+        elif word == "bag":
+            bag(*map(float, rest))
         elif word == "play":
             package, _, name = rest[1].split("/")
             kind = getattr(importlib.import_module(f"{package}.msg"), name)
@@ -99,6 +121,7 @@ rclpy.init()
 node = rclpy.create_node("stranger")
 for topic, (kind, read, qos) in TOPICS.items():
     node.create_subscription(kind, topic, lambda m, topic=topic, read=read: hear(topic, read, m), qos)
-sensor = node.create_publisher(WrenchStamped, "/ft/wrench", 10)
+sensor, bagged = (node.create_publisher(WrenchStamped, name, 10) for name in ("/ft/wrench", "/bag/wrench"))
+clock = node.create_publisher(Clock, "/clock", 10)
 threading.Thread(target=orders, daemon=True).start()
 rclpy.spin(node)

@@ -24,7 +24,10 @@ from tests.bridges.conftest import FakeService
 from tests.waiting import WAIT_S, end, until
 
 pytestmark = [pytest.mark.live, pytest.mark.release]
-NODE = [*map(str, (needs.ROS_PYTHON, needs.ROS_NODE)), "--ros-args", "-r", "__node:=palm", "-r", "__ns:=/left"]
+STARTED = [*map(str, (needs.ROS_PYTHON, needs.ROS_NODE)), "--ros-args"]
+NODE = [*STARTED, "-r", "__node:=palm", "-r", "__ns:=/left"]
+OTHER_NODE = [*STARTED, "-r", "__node:=sole", "-r", "__ns:=/right", "-p", "skin:=sole"]
+ADMITTANCE = [str(needs.ROS_PYTHON), str(needs.ROS_NODE.with_name("admittance")), "--ros-args"]
 
 
 class Heard:
@@ -82,7 +85,9 @@ def test_a_stranger_hears_all_of_a_skin_and_that_it_is_not_valid(heard: Heard, f
     assert not [m for m in heard.of("wrench") if min(abs(m["stamp"] - at) for at in bad) < 5e-3]
 
 
-def test_tare_parameters_quality_of_service_and_the_robots_own_sensor(heard: Heard, fake: FakeService) -> None:
+def test_tare_parameters_quality_of_service_and_the_robots_own_sensor(
+    heard: Heard, fake: FakeService, tmp_path: Path
+) -> None:
     heard.until("contacts", lambda c: c[0])
     heard.order("tare")
     assert heard.until("tare") == [True, "new baseline from 64 frames"] and fake.tares == ["palm"]
@@ -97,10 +102,39 @@ def test_tare_parameters_quality_of_service_and_the_robots_own_sensor(heard: Hea
     pressed = until(lambda: (heard.order("press", 2.5), reader.recv(0.1))[1])
     assert (pressed.force_n, pressed.valid) == (2.5, True)
     reader.close()
-    for wrong, says in (("use_sim_time:=true", "expected false"), ("reference_axis:=up", "one of x, y, z")):
-        given = [*NODE, "-p", "reference_topic:=/ft", "-p", wrong]
-        ran = subprocess.run(given, **heard.options, capture_output=True, timeout=WAIT_S)
+    tmp_path.chmod(0o755)
+    for wrong, runtime, says in (
+        ("use_sim_time:=true", "", "expected false"),
+        ("reference_axis:=up", "", "one of x, y, z"),
+        ("marker_rate:=0.0", "", "out of range"),
+        ("skin:=palm", str(tmp_path), "has mode 0755, expected 0700"),
+    ):
+        given = [*NODE, "-p", wrong, *(() if runtime else ("-p", "reference_topic:=/ft"))]
+        environment = heard.options["env"] | ({"EITSKIN_RUNTIME": runtime} if runtime else {})
+        ran = subprocess.run(given, env=environment, text=True, capture_output=True, timeout=WAIT_S)
         assert ran.returncode == 1 and says in ran.stderr and "Traceback" not in ran.stderr, ran.stderr
+
+
+def test_two_skins_in_two_namespaces(heard: Heard, fake: FakeService) -> None:
+    other = subprocess.Popen(OTHER_NODE, **heard.options)
+    try:
+        assert heard.until("/right/sole/contacts", lambda c: c[0]) == [True, [], [], "sole"]
+        assert heard.until("contacts", lambda c: c[0])[3] == "palm"
+    finally:
+        end(other)
+
+
+def test_a_robot_that_gives_way_stands_still_once_a_bag_begins_anew(heard: Heard) -> None:
+    given = [*ADMITTANCE, "-p", "use_sim_time:=true", "-r", "wrench:=/bag/wrench", "-r", "twist:=/bag/twist"]
+    admittance = subprocess.Popen(given, **heard.options)
+    speeds = lambda start: [m["value"] for m in heard.of("/bag/twist") if start <= m["stamp"] < start + 1]  # noqa: E731
+    played = lambda start, force: (heard.order("bag", start, force), time.sleep(0.5), speeds(start))[2]  # noqa: E731
+    try:
+        pushed = until(lambda: played(100, 3), admittance)
+        assert -0.075 <= min(pushed) < -0.01
+        assert set(until(lambda: played(50, 0), admittance)) == {0.0}
+    finally:
+        end(admittance)
 
 
 def test_an_exported_recording_is_played_to_a_stranger(heard: Heard, tmp_path: Path) -> None:
