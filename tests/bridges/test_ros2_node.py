@@ -122,6 +122,7 @@ def test_two_skins_in_two_namespaces(heard: Heard, fake: FakeService) -> None:
         assert heard.until("contacts", lambda c: c[0])[3] == "palm"
     finally:
         end(other)
+    assert other.returncode == 0
 
 
 def test_a_robot_that_gives_way_stands_still_once_a_bag_begins_anew(heard: Heard) -> None:

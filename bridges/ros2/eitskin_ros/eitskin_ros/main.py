@@ -11,10 +11,13 @@ import sys
 import rclpy
 from eitskin.errors import EitskinError
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
 from .node import SkinNode
 from .reader import ReaderThread
+
+LOOK_S = 0.5
+"""How often it looks whether it is to end: one SIGTERM in some fifteen does not wake `rclpy.spin` of Jazzy."""
 
 
 def main() -> int:
@@ -23,7 +26,10 @@ def main() -> int:
     try:
         node = SkinNode()
         reader = ReaderThread(node)
-        rclpy.spin(node)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        while rclpy.ok():
+            executor.spin_once(timeout_sec=LOOK_S)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (EitskinError, NameValidationException, ParameterException) as why:
