@@ -136,7 +136,7 @@ def markers(ros: Any, head: Any, frame: Any) -> Any:
         for ns, kind, scale, colour, more in (
             ("patch", CYLINDER, (across, across, 0.001), (1.0, 0.5, 0.1, 0.6), {"pose": _pose(ros, c)}),
             ("force", ARROW, (0.002, 0.005, 0.006), (0.9, 0.1, 0.1, 1.0), {"points": points}),
-            ("label", TEXT, (0.0, 0.0, 0.008), (1.0, 1.0, 1.0, 1.0), {"pose": ros.Pose(position=points[0])}),
+            ("label", TEXT, (0.0, 0.0, 0.004), (1.0, 1.0, 1.0, 1.0), {"pose": ros.Pose(position=points[0])}),
         ):
             shade = ros.ColorRGBA(**dict(zip("rgba", colour, strict=True)))
             text = views.label(c) if ns == "label" else ""
