@@ -44,8 +44,7 @@ class EitskinError(Exception):
         ├── ConfigError                       services: skin.toml cannot be used
         ├── NoRoom                            the system allows too few descriptors, processes, or too little memory
         ├── Refused                           a stage does not carry out a command now
-        ├── NoBaseline (ValueError)           frames, or a saved state, do not make a baseline
-        ├── TareRefused (ValueError)          the latest scans make no baseline
+        ├── NoBaseline (ValueError)           frames, the latest scans or a saved state make no baseline
         ├── PortError                         the board's port cannot be opened, or is gone
         ├── RecordingError (ValueError)       a file is not a recording, or cannot be written
         ├── ReplayError                       a replay cannot begin or go on
