@@ -38,6 +38,8 @@ class Damage:
     zeros: int = 0
     bad_chunks: int = 0
     too_large: int = 0
+    repeated: int = 0
+    """Chunks that stood in the file before: part of it was written or copied twice."""
     index: bool = False
     nameless: int = 0
     medium: str = ""
@@ -59,7 +61,8 @@ class Damage:
     @property
     def whole(self) -> bool:
         """Whether all that was to be recorded is there, and the file is as it was written."""
-        found = self.truncated, self.places, self.bad_chunks, self.too_large, self.index, self.nameless, self.medium
+        chunks = self.bad_chunks, self.too_large, self.repeated
+        found = self.truncated, self.places, *chunks, self.index, self.nameless, self.medium
         return not (any(found) or self.missing or self.unwritten)
 
     def __str__(self) -> str:
@@ -74,6 +77,7 @@ class Damage:
             (self.places, f"{self.lost_bytes} bytes {what} in {self.places} place(s), {first}"),
             (self.bad_chunks, f"{self.bad_chunks} chunk(s) with a wrong checksum left out"),
             (self.too_large, f"{self.too_large} chunk(s) of more than 16 MB left out"),
+            (self.repeated, f"{self.repeated} chunk(s) that stand there twice are read once"),
             (self.index, "its index is damaged"),
             (self.nameless, f"{self.nameless} message(s) of an unknown topic left out"),
             (self.missing, self._missing()),
@@ -103,10 +107,12 @@ class MissingMessages:
         self.seen = 0
         self._last: dict[str, tuple[int, bytes]] = {}
 
-    def take(self, topic: str, sequence: int, data: bytes) -> None:
-        """One that is there. Files of other makers have no numbers, all 0."""
+    def take(self, topic: str, sequence: int, data: bytes, again: bool = False) -> None:
+        """One that is there, perhaps `again`. Files of other makers have no numbers, all 0."""
         self.seen += 1
         before, last = self._last.get(topic, (0, b""))
+        if sequence <= before and again:
+            return
         if sequence <= before:  # a recording of its own, whose beginning is lost
             before, last = 0, b""
         self._last[topic] = sequence, data

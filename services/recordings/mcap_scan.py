@@ -58,7 +58,7 @@ class McapScan:
     """Gives the records of `file` in order, and counts in `damage` what belongs to none."""
 
     def __init__(self, file: BinaryIO, damage: Damage, unpack: bool = True, most: int = 2**63) -> None:
-        """unpack: else chunks are passed over unread. most: bytes of the file to scan."""
+        """unpack: else chunks are given empty, unread. most: bytes of the file to scan."""
         self._file, self._fd, self.damage, self._unpack = file, file.fileno(), damage, unpack
         self.size = min(most, file.seek(0, io.SEEK_END))
         self.most = max(SMALL, RATIO * self.size)
@@ -122,7 +122,7 @@ class McapScan:
         end = at + _HEAD.size + length
         if kind == Opcode.CHUNK or _is_chunk(body, length):
             if not self._unpack:
-                return None, end if sound else at
+                return (ScannedRecord(at, kind, b""), end) if sound else (None, at)
             found, last = self._chunk(at, body, end, sound)
             if found is not None and (kind != Opcode.CHUNK or last != end):  # its head alone is damaged
                 self.damage.lose(at, at)

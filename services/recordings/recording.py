@@ -285,7 +285,7 @@ class RecordingReader:
             scan = McapScan(file, self.damage)
             for message in _MessageReading(scan).messages():
                 first_ns = message.log_time_ns if first_ns is None else first_ns
-                if message.log_time_ns - first_ns < start_s * 1e9:
+                if start_s and message.log_time_ns - first_ns < start_s * 1e9:
                     continue
                 if topics is None or message.topic.partition("/")[0] in topics:
                     yield message
@@ -301,7 +301,7 @@ class _MessageReading:
 
     def __init__(self, scan: McapScan) -> None:
         self.scan, self.damage = scan, scan.damage
-        self._begin_ns = 0
+        self._seen: set[tuple[int, int]] = set()  # checksum and length of each chunk
         self._begin()
 
     def _begin(self) -> None:
@@ -316,8 +316,12 @@ class _MessageReading:
         for record in self.scan.records():
             if record.kind == Opcode.CHUNK:
                 self._chunked = True
+                known = zlib.crc32(record.body), len(record.body)  # and with them the time and number of each message
+                again = known in self._seen
+                self._seen.add(known)
+                self.damage.repeated += again
                 for kind, body in inner_records(record.body):
-                    yield from self._contents(record.at, kind, body)
+                    yield from self._contents(record.at, kind, body, again)
             elif record.kind == Opcode.CHANNEL or (record.kind == Opcode.MESSAGE and not self._chunked):
                 yield from self._contents(record.at, record.kind, record.body)
             else:
@@ -360,8 +364,8 @@ class _MessageReading:
         self.damage.index |= self._ended and not self._confirmed
         self.damage.confirmed &= self._confirmed
 
-    def _contents(self, at: int, kind: int, body: bytes) -> Iterator[RecordedMessage]:
-        """Messages; channels are noted. at: of the record of the file."""
+    def _contents(self, at: int, kind: int, body: bytes, again: bool = False) -> Iterator[RecordedMessage]:
+        """Messages, where they have not been given before; channels are noted. at: of the record of the file."""
         if kind == Opcode.CHANNEL:
             if (channel := parsed(Opcode.CHANNEL, body)) is not None:
                 self._topics[channel.id] = channel.topic
@@ -374,8 +378,9 @@ class _MessageReading:
             if not topic:
                 self.damage.nameless += 1
                 return
-            self._missing.take(topic, sequence, data)
-            yield RecordedMessage(topic, log_time_ns, data)
+            self._missing.take(topic, sequence, data, again)
+            if not again:
+                yield RecordedMessage(topic, log_time_ns, data)
 
     def _topics_at_the_end(self, at: int) -> dict[int, str]:
         """The channels that are repeated in the index: those of the first chunk, where this is lost."""

@@ -55,7 +55,7 @@ def steps(reader: RecordingReader, start_s: float = 0.0, only: str = "") -> Iter
     for last_ns, step in _timed_steps(reader, only):
         if step.raw is None and step.skin in held:
             held.remove(step.skin)  # that one is in `latest` already
-        elif last_ns >= start_s * 1e9:
+        elif not start_s or last_ns >= start_s * 1e9:
             if step.skin in latest:
                 yield latest.pop(step.skin)
             any_raw = any_raw or step.raw is not None

@@ -117,14 +117,17 @@ class _Reading:
 
     def __init__(self, into: SessionSummary) -> None:
         self.into = into
+        self._zero_ns = 0
         self._faults: dict[tuple[str, str], Span] = {}
         self._contacts: dict[tuple[str, str, int], ContactSpan] = {}
 
     def take(self, message: RecordedMessage) -> None:
         into = self.into
         if not into.topics:
-            into.start_ns = message.log_time_ns
-        at_s = (message.log_time_ns - into.start_ns) * 1e-9
+            into.start_ns = self._zero_ns = message.log_time_ns
+        if message.log_time_ns < self._zero_ns:  # a recording that was joined to a later one: it goes on from there
+            self._zero_ns = message.log_time_ns - int(into.duration_s * 1e9)
+        at_s = (message.log_time_ns - self._zero_ns) * 1e-9
         into.duration_s = max(into.duration_s, at_s)
         of = into.topics.setdefault(message.topic, TopicCount())
         frame: Frame | None = None

@@ -132,6 +132,12 @@ def test_topics_gaps_faults_and_contacts_are_found(recording: Path) -> None:
     (touch,) = found.contacts
     assert (touch.what, touch.most_n, touch.place) == ("3", pytest.approx(4.0), (0.01, 0.02, 0.0))
     assert (touch.begin_s, touch.end_s) == (pytest.approx(2.0), pytest.approx(3.95))
+    later = recording.with_name("later.mcap")
+    with RecordingWriter(later) as writer:
+        writer.write("contact/palm", b"rubbish", 1_800_000_000 * 10**9)
+    later.write_bytes(later.read_bytes() + recording.read_bytes())  # joined, the newer one first
+    joined = summarise(later)
+    assert (joined.topics["contact/palm"].messages, joined.duration_s) == (182, pytest.approx(10.0))
 
 
 def test_it_is_told_in_text_as_json_and_as_a_picture(skin: Callable[..., Ran], recording: Path, tmp_path: Path) -> None:  # noqa: F811

@@ -128,10 +128,13 @@ def raws(path: Path, first: int, chunks: int) -> tuple[bytes, list[int]]:
     ("zeros from 6 on", "012345", "cut short: it has no end; .* bytes damaged in 1 place"),
     ("joined", "01234567890123456789", "2 recordings joined$"),
     ("cut, joined", "0123450123456789", "2 recordings joined; cut short"),
+    ("begun anew", "0123456789", "2 recordings joined; cut short: .*6 chunk(s) that stand there twice are read once$"),
+    ("copied twice", "0123456789", "3 chunk(s) that stand there twice are read once; no message is missing"),
+    ("chunks alone", "012345678", "cut short: it has no end; 0 bytes damaged in 1 place(s), the first at byte 0$"),
 ])  # fmt: skip
 def test_what_is_left_is_read_and_the_rest_counted(tmp_path: Path, what: str, left: str, says: str) -> None:
     path = tmp_path / "a.mcap"
-    content, at = raws(path, 100, 10)
+    (later, _), (content, at) = raws(tmp_path / "b.mcap", 200, 10), raws(path, 100, 10)
     spoilt = bytearray(content)
     places = {"magic": [0], "first chunk": [at[0]], "last chunk": [at[9]], "first chunk, cut": [at[0]]}
     places |= {"chunks 3, 4 and 7": [at[3], at[4], at[7]], "end": [content.rindex(b"\x0b") + 20]}
@@ -140,11 +143,14 @@ def test_what_is_left_is_read_and_the_rest_counted(tmp_path: Path, what: str, le
         spoilt[inside : inside + 8] = bytes(byte ^ 0x5A for byte in spoilt[inside : inside + 8])
     whole, cut = bytes(spoilt), bytes(spoilt[: at[6] + 30])
     longer = {"first chunk, cut": cut, "zeros behind": whole + bytes(5000), "zeros from 6 on": cut[:-30] + bytes(4096)}
-    path.write_bytes((longer | {"joined": whole * 2, "cut, joined": cut + whole}).get(what, whole))
+    longer |= {"joined": later + whole, "cut, joined": cut + later, "begun anew": cut + whole}
+    longer |= {"copied twice": whole[: at[6]] + whole[at[3] :], "chunks alone": whole[at[0] : at[9]]}
+    path.write_bytes(longer.get(what, whole))
     reader = RecordingReader(path)
     assert "".join(str(m.log_time_ns % 10) for m in reader.messages()) == left.replace(" ", "")
     assert re.search(says.replace("(", r"\(").replace(")", r"\)"), str(reader.damage)), str(reader.damage)
-    assert reader.metadata == {"version": "1"} and reader.damage.whole == (what == "joined")
+    assert reader.metadata == {"version": "1"} or what == "chunks alone"
+    assert reader.damage.whole == (what == "joined")
 
 
 def test_without_channels_topics_are_known_by_fields_and_what_is_no_recording_is_refused(tmp_path: Path) -> None:
