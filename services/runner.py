@@ -245,12 +245,13 @@ class Runner:
         if isinstance(feed, StageReader):
             feed.mind()
         beat.drops["malformed"], beat.drops["skipped"] = feed.malformed, feed.skipped
-        silent = "" if channel.asleep else beat.silence(SILENT_S, stage.reads)
         try:
             stage.between_frames()
         except Exception as why:  # what could not be adopted is not in use
             self._log_failure(channel, why, "%s: could not adopt (further such failures are counted)")
         health = stage.health().with_problems([*problems, *([channel.unkept] if channel.unkept else [])])
+        explained = not stage.reads and health.level == "ERROR"  # a source says itself why it gives nothing
+        silent = "" if channel.asleep or explained else beat.silence(SILENT_S, stage.reads)
         status = beat.status(health, silent, now, HEARTBEAT_S, asleep=channel.asleep)
         if status is not None:
             self._send(channel, status)

@@ -27,15 +27,19 @@ RFC2217 = "rfc2217://"
 NETWORK = ("socket://", RFC2217)
 
 OTHER = "is it the board's? Correct `port` in skin.toml"
-BUSY = rb"(?i)in use|busy|already|locked|too many|denied|refused|not available"  # in the first line of a gateway
-KNOWN = (  # what it is, by which bytes, what to do
-    ("a satellite receiver (NMEA)", rb"[$!][A-Z]{5},[^\r\n]*,", OTHER),
+TELNET = rb"\xff[\xfb-\xfe]."  # what its two ends settle first
+BUSY = rb"in use|busy|already|locked|too many|maximum|exceed|occupied|denied|refused|not available"
+SERVERS = (  # of a network: what it is, by which bytes, what to do
     ("a web server (HTTP)", rb"\AHTTP/|(?i:<html)", OTHER),
     ("an SSH server", rb"\ASSH-", OTHER),
     ("a mail or file server", rb"\A(220[ -]|\+OK|\* OK)", OTHER),
     ("a server that speaks TLS", rb"\A[\x15\x16]\x03", OTHER),
     ("a ZeroMQ socket", rb"\A\xff.{8}\x7f", OTHER),
-    ("a telnet server", rb"\A\xff[\xfb-\xfe]", "give its raw port, or write rfc2217:// where it speaks that"),
+    ("a busy gateway", rb"(?i)\A([^\n]*\n){0,2}[^\n]*?(" + BUSY + rb")", "close the other connection to it"),
+    ("a telnet server", rb"\A" + TELNET, "give its raw port, or write rfc2217:// where it speaks that"),
+)
+DEVICES = (
+    ("a satellite receiver (NMEA)", rb"[$!](P[A-Z]{3}|[A-Z]{5})\w*,[^\r\n]*,", OTHER),
     ("a console that asks for a login", rb"(?i)login:|password:", OTHER),
     ("a boot loader", rb"ets [A-Z][a-z]{2} |rst:0x|ESP-ROM|U-Boot", "flash the board's firmware"),
     ("a Python prompt", rb"MicroPython|CircuitPython|>>> ", "flash the board's firmware"),
@@ -75,18 +79,21 @@ class OtherEnd:
 
     def closed(self, why: str) -> str:
         """The same where the connection is lost, for which the port has a reason of its own."""
-        network = self.url.lower().startswith(NETWORK)
         if self.answered:
-            return self.sentence(and_then=f", and {'closes the connection' if network else 'is gone'}")
-        if network:
+            return self.sentence(and_then=f", and {'closes the connection' if self._network else 'is gone'}")
+        if self._network:
             return (
                 f"no board at {self.url}: the connection is closed without a word: a gateway does so while another "
                 "program uses its port; close that one"
             )
         return why
 
+    @property
+    def _network(self) -> bool:
+        return self.url.lower().startswith(NETWORK)
+
     def _silent(self) -> str:
-        if self.url.lower().startswith(NETWORK):
+        if self._network:
             return "the connection is taken and nothing is said: is a board wired to that gateway, and powered?"
         return "no answer to HELLO, and nothing else comes: is the board powered, and is its firmware running?"
 
@@ -106,21 +113,19 @@ class OtherEnd:
         return self._foreign()
 
     def _foreign(self) -> tuple[str, str]:
-        first_bytes, text = quoted(self._quoted), text_share(self._received) >= TEXT
-        line = self._received.strip().partition(b"\n")[0]
-        if text and self.url.lower().startswith(NETWORK) and re.search(BUSY, line):
-            return f"found a busy gateway, which sends {first_bytes}", "close the other connection to it"
-        for what, pattern, advice in KNOWN:
-            if re.search(pattern, self._received, re.DOTALL):
-                return f"found {what}, which sends {first_bytes}", advice
-        if text:
+        for what, pattern, advice in (*SERVERS, *DEVICES) if self._network else DEVICES:
+            if found := re.search(pattern, self._received, re.DOTALL):
+                line = self._received[self._received.rfind(b"\n", 0, found.end()) + 1 :]
+                return f"found {what}, which sends {quoted(re.sub(TELNET, b'', line) or line)}", advice
+        first_bytes = quoted(self._quoted)
+        if text_share(self._received) >= TEXT:
             return f"found text, {first_bytes}", "is it the board's port, and has the board its firmware?"
         if not self._received.strip(b"\0\xff"):
             return (
                 f"found nothing but bytes of 0 or 255, {first_bytes}",
                 "is the board powered, and its wire connected?",
             )
-        if sum(map(_runs, self._received)) > SLOWER * len(self._received):
+        if sum(map(_runs, self._received)) > SLOWER * max(ENOUGH, len(self._received)):
             what = f"found bytes as from a line slower than our {self.baud} baud, {first_bytes}"
             return what, "set `baud` in skin.toml to the board's"
         what = f"found bytes that are neither text nor a board's, {first_bytes}"

@@ -264,6 +264,11 @@ AT_PORTS = {
     "cut": (b"".join(sent(n)[:200] + sent(n)[260:] for n in range(4)), "", "none of them whole"),
     "held": (b"", "socket://h:1", "the connection is taken and nothing is said"),
     "busy": (b"Port already in use\r\n", "socket://h:1", 'busy gateway, which sends "Port already in use", and closes'),
+    "busy, after a greeting": (
+        b"\xff\xfb\1*** gw ***\r\nport occupied\r\n", "socket://h:1", 'gateway, which sends "port occupied", and closes'
+    ),
+    "http": (b"HTTP/1.1 503 busy\r\n\r\n", "socket://h:1", "found a web server (HTTP)"),
+    "no telnet": ("ready\r\n".encode("utf-16"), "", "neither text nor a board's, "),
     "blank lines": (b"\r\n" * 9, "socket://h:1", 'found text, "\\x0d\\x0a'),
     "telnet": (b"\xff\xfd\x18login: ", "socket://h:1", "found a telnet server"),
 }  # fmt: skip

@@ -19,7 +19,7 @@ from services.runner import Runner
 from services.runtime import lateness
 from services.runtime.config import ROOT, parse
 from services.runtime.lateness import Lateness
-from services.runtime.stage import Stage
+from services.runtime.stage import Health, Stage
 from tests.waiting import WAIT_S, until
 
 PALM = {"port": "stub", "bundle": "square16"}
@@ -212,6 +212,10 @@ def test_what_queued_up_is_judged_and_what_fails_is_counted(driven, caplog, skip
 
     def steps():
         until(lambda: "raw" in stage.told)
+        stage.health = lambda: Health("ERROR", ["no board"])  # which says why no frames come
+        time.sleep(1.0)
+        assert control.call("status")["messages"] == ["no board"]
+        del stage.health
         late = sent(*raws(90, 80, 1, 0.1, 70), count=3)
         assert late == [(2, True, []), (3, True, []), (4, False, ["late"])]
         assert control.call("status")["drops"] == {"late": 2, "failed": 0, "malformed": 0, "skipped": 0}
