@@ -40,6 +40,9 @@ def npz(file: BinaryIO, name: str, most: int = MAX_NPZ) -> dict[str, NDArray[Any
         with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
             _check_sizes(entries, packed, name, most)
+            if entries and not any(entry.filename.endswith(".npy") for entry in entries):
+                held = ", ".join(repr(entry.filename[:40]) for entry in entries[:3])
+                raise FileError(f"{name} is a zip of {held}, expected an npz (numpy.savez): unpack it, or save as csv")
             return {entry.filename.removesuffix(".npy"): _array(archive, entry, name) for entry in entries}
     except FileError:
         raise

@@ -8,6 +8,7 @@ sense+, sense-).
 from __future__ import annotations
 
 import re
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -47,9 +48,28 @@ def parse_table(text: str, name: str) -> NamedColumns:
         raise FileError(f"{name}: found no line of numbers")
     split = _splitter(lines[-1][1])
     rows = [(at, split(line)) for at, line in lines]
+    above = _preamble(rows)
     names = _names(rows, [split(line) for at, line in remarks if at < lines[0][0]])
+    if names and rows and _holds_text_alone(rows[0][1]):  # units
+        above.append(rows.pop(0)[0])
     width = _width(rows, names, name)
-    return _sorted_out(rows, [each.strip("\"' ").lower() for each in names] or [""] * width, name)
+    found = _sorted_out(rows, [each.strip("\"' ").lower() for each in names] or [""] * width, name)
+    if above:
+        found.understood = "; ".join(filter(None, (f"line {', '.join(map(str, above))} left out", found.understood)))
+    return found
+
+
+def _preamble(rows: list[tuple[int, list[str]]]) -> list[int]:
+    """Takes the lines before the table from `rows`: of text, and much shorter than most; their numbers."""
+    width, taken = Counter(len(cells) for _, cells in rows).most_common(1)[0][0], []
+    while len(rows[0][1]) <= width // 2 and any(_number(cell) is None for cell in rows[0][1]):
+        taken.append(rows.pop(0)[0])
+    return taken
+
+
+def _holds_text_alone(cells: list[str]) -> bool:
+    numbers = [_number(cell) for cell in cells]
+    return None in numbers and all(number is None or np.isnan(number) for number in numbers)
 
 
 def _width(rows: list[tuple[int, list[str]]], names: list[str], name: str) -> int:
@@ -74,9 +94,21 @@ def _names(rows: list[tuple[int, list[str]]], above: list[list[str]]) -> list[st
 
 def _are_names(cells: list[str]) -> bool:
     """Whether the first line names columns: by text, or by their numbers, as pandas does. One of an index is empty."""
-    filled = [cell for cell in cells if cell.strip("\"' ")]
-    numbered = [[str(at) for at in range(first, first + len(filled))] for first in (0, 1)]
-    return all(_number(cell) is None for cell in filled) or (len(filled) > 2 and filled in numbered)
+    filled = [name for cell in cells if (name := cell.strip("\"' "))]
+    counted = len(filled) > 2 and all(map(str.isdecimal, filled)) and _counting(filled) is not None
+    return counted or all(_number(cell) is None for cell in filled)
+
+
+def _counting(names: list[str]) -> NDArray[np.intp] | None:
+    """Which column is which measurement, by names that count them up from 0 or 1, in whatever order they stand; None
+    where the names do not.
+    """
+    found = [re.findall(r"\d+", each) for each in names]
+    if {len(each) for each in found} != {1}:
+        return None
+    numbers = np.array([int(each[0][:6]) for each in found])
+    order, first = np.argsort(numbers), numbers.min()
+    return order if first in (0, 1) and (numbers[order] - first == np.arange(len(numbers))).all() else None
 
 
 def _splitter(line: str) -> Any:
@@ -116,6 +148,9 @@ def _sorted_out(rows: list[tuple[int, list[str]]], names: list[str], name: str) 
         notes.append(f"{untouched.sum()} rows are `untouched`, as column {names[label] or label + 1} says")
     if (pattern := _pattern(own)) is not None:
         found["pattern"] = pattern
+    if (order := _counting(own)) is not None and (order[1:] < order[:-1]).any():
+        found |= {each: values[:, order] for each, values in found.items()}
+        notes.append("columns put in the order of their numbers")
     found.understood = "; ".join(filter(None, notes))
     return found
 

@@ -245,9 +245,15 @@ def as_text(rows, sign: str, decimal: str) -> bytes:
 
 
 def numbered(rows) -> bytes:
-    """As pandas writes them, in an older Windows."""
-    lines = [f"{at}," + ",".join(f"{abs(v):.9g}" for v in row) for at, row in enumerate(rows)]
-    return "\n".join(["# \xb5V", "," + ",".join(map(str, range(120))), *lines]).encode("latin-1")
+    """As pandas writes them, in an older Windows, in an order of their own."""
+    lines = [f"{at}," + ",".join(f"{abs(v):.9g}" for v in row[::-1]) for at, row in enumerate(rows)]
+    return "\n".join(["# \xb5V", "," + ",".join(map(str, range(120)[::-1])), *lines]).encode("latin-1")
+
+
+def under_a_preamble(rows) -> bytes:
+    """As instruments write them: what was measured, names, units."""
+    text = as_text(rows, ",", ".").decode("utf-8-sig").replace("\n", "\n" + "s," + "V," * 120 + "-\n", 1)
+    return f"Analyser 4\nDate,2024-05-01\n\n{text}".encode()
 
 
 def in_a_remark(rows) -> bytes:
@@ -255,7 +261,8 @@ def in_a_remark(rows) -> bytes:
     return b"# " + as_text(rows, " ", ".").replace(b"time (s)", b"time").decode("utf-8-sig").encode()
 
 
-KINDS = ["names.csv", "names.csv.gz", "decimal_comma.csv", "remark.txt", "numbered.csv", "v5.mat", "v4.mat", "bare.npy"]
+KINDS = ["names.csv", "names.csv.gz", "decimal_comma.csv", "remark.txt", "numbered.csv", "lines.csv"]
+KINDS += ["v5.mat", "v4.mat", "bare.npy", "no_names.npz"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -267,13 +274,15 @@ def test_files_of_every_kind(tmp_path: Path, kind: str) -> None:
         "decimal_comma.csv": lambda: out.write(as_text(rows, ";", ",")),
         "remark.txt": lambda: out.write(in_a_remark(rows)),
         "numbered.csv": lambda: out.write(numbered(np.roll(rows, M, axis=0))),
+        "lines.csv": lambda: out.write(under_a_preamble(rows)),
         "v5.mat": lambda: scipy.io.savemat(out, {"vi": rows[:N], "vh": rows[N:], "note": "foam"}, do_compression=True),
         "v4.mat": lambda: scipy.io.savemat(out, {"data": rows[:N].T, "baseline": rows[N:].T}, format="4"),
         "bare.npy": lambda: np.save(out, np.roll(rows, M, axis=0)),
+        "no_names.npz": lambda: np.savez(out, np.roll(rows, M, axis=0)),
     }[kind.removesuffix(".gz")]()
     whole = gzip.compress(out.getvalue()) if kind.endswith(".gz") else out.getvalue()
     path.write_bytes(whole)
-    untouched = str(M) if kind in ("bare.npy", "numbered.csv") else ""
+    untouched = str(M) if kind in ("bare.npy", "no_names.npz", "numbered.csv") else ""
     found = read_scans(load_npz(path), PAIRS, reading_options("", "", untouched))
     np.testing.assert_allclose(abs(found.measurements), abs(rows[:N]), rtol=1e-7)
     np.testing.assert_allclose(found.untouched, abs(rows[N:]), rtol=1e-7)

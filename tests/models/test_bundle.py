@@ -156,6 +156,7 @@ WRONG = {
     "is object": {"a.npy": npy((1,), "|O", b"x")},
     "has 8 bytes, expected 8796093022208": {"a.npy": npy((2**40,), "<f8", bytes(8))},
     "no npz of plain arrays": {"a.npy": b"hello"},
+    "is a zip of 'xl/a.xml'": {"xl/a.xml": b"<x/>"},
     "found 300 arrays": MANY,
     "unpack to .* no measurements pack so well": {"a.npy": DENSE},
 }
