@@ -80,6 +80,9 @@ def read_columns(
     for name, each in rows.items():
         rows[name], note = layout.taken(name, each)
         notes.append(note)
+    complex_ = {name for name, each in rows.items() if each.dtype.kind == "c" and each.imag.any()}
+    if complex_ and (real := rows.keys() - complex_):
+        notes.append(f"`{min(real)}` is real beside a complex `{min(complex_)}`, so magnitudes")
     if plain is not None and layout.by_default and bundle.matrices.normalisation == "model":
         _doubt(plain, layout)
     if isinstance(options.untouched, int) and options.untouched and "measurements" in rows:

@@ -237,6 +237,12 @@ def test_several_readings_or_none_are_refused_with_what_to_say(bundle, of, says:
         read_scans({name: of(z) for name, z in split(rows_of(bundle)).items()}, bundle)
 
 
+def test_real_rows_beside_complex_ones_are_said_to_be_magnitudes() -> None:
+    data = split(rows_of(PAIRS))
+    found = read_scans(data | {"untouched": abs(data["untouched"])}, PAIRS)
+    assert found.understood == "`untouched` is real beside a complex `measurements`, so magnitudes"
+
+
 def as_text(rows, sign: str, decimal: str) -> bytes:
     names = ["time (s)", *(f"z_{i}_{j}" for i, j, *_ in PAIRS.pattern + 1), "label"]
     labels = ["touch"] * N + ["empty"] * M
