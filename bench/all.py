@@ -27,6 +27,7 @@ from bench import REPORTS, ROOT, commands
 from bench.goals import Goal
 from bench.json_file import write_json
 from bench.speed.service import end_on_sigterm
+from protocol.whole_file import write_whole
 
 KEPT = 5  # reports before, whose figures a new one keeps
 SCATTER = 3.0  # standard deviations of those
@@ -142,7 +143,7 @@ def main(argv: list[str] | None = None) -> int:
         end_on_sigterm()
         wanted = [b for b in BENCHMARKS if args.only is None or b.name in args.only]
         failed = [said for each in wanted if (said := run(each, args.out.resolve(), args.quick))]
-    (args.out / "README.md").write_text(page(BENCHMARKS, args.out), encoding="utf-8")
+    write_whole(args.out / "README.md", page(BENCHMARKS, args.out))
     print(f"wrote {args.out / 'README.md'}")
     for problem in failed:
         print(f"FAILED: {problem}", file=sys.stderr)

@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 from bench import REPORTS
+from protocol.whole_file import whole_file
 
 STYLE: Any = {"font.size": 13, "axes.titlesize": 14, "legend.fontsize": 11, "lines.markersize": 8}
 ACCURACY = (  # level, figure, title
@@ -36,7 +37,8 @@ def panels(path: Path, rows: int, columns: int, size: tuple[float, float]) -> It
         figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
         yield list(axes.ravel())
         path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=100)
+        with whole_file(path) as part:
+            figure.savefig(part, dpi=100)
         plt.close(figure)
 
 

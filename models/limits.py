@@ -32,6 +32,7 @@ from models.pressure import FOAM, disc
 from models.scan_limits import WANDER_V
 from models.scan_table import ScanTable
 from models.shapes import Shape
+from protocol.whole_file import whole_file
 
 __all__ = ["Floor", "MeasurementNoise", "SizePrior", "floors", "map_floors", "mean_floor", "rank_patterns"]
 
@@ -128,7 +129,8 @@ def draw(case: Case, radius: float, drop: float, per_side: int, path: Path) -> N
         f"{case.skin}, {name}, {_noise(case.noise)}: Bayesian floor of a touch, radius "
         f"{_mm(case.skin, radius)}, drop {drop} S/m"
     )
-    figure.savefig(path, dpi=110)
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=110)
     plt.close(figure)
 
 
