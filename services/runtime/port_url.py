@@ -73,8 +73,9 @@ def _url(port: str, kind: str, options: Options) -> str:
     try:
         parts = urlsplit(port)
         number = parts.port if kind in ("socket", "rfc2217") else None
-    except ValueError as why:
-        return str(why).lower()
+        (parts.hostname or "").encode("idna")  # as it is asked for
+    except ValueError:
+        return "found no name or address and a number up to 65535; an address with colons stands in brackets, [::1]"
     if kind in ("socket", "rfc2217"):
         if not parts.hostname or not number or parts.path.strip("/") or "@" in parts.netloc or parts.fragment:
             return f"found the host {parts.hostname or 'missing'}, the port {number or 'missing'}"

@@ -22,6 +22,7 @@ OF_A_SKIN = [
         "socket://h": "socket://HOST:PORT (found the host h, the port missing)", "socket://:1": "socket://HOST:PORT",
         "socket://h:x": "socket://HOST:PORT", "socket://[::1": "socket://HOST:PORT", "socket://h:70000": "socket://HO",
         "rfc2217://h": "rfc2217://HOST:PORT", "rfc2217://h:1?timeout=x": "rfc2217://HOST:PORT (found timeout=x",
+        "rfc2217://a..b:1": "rfc2217://HOST:PORT (found no name", "socket://::1:4000": "socket://HOST:PORT (found no n",
         "spy://ttyUSB0": "spy:///dev/ttyACM0", "alt:///dev/a?class=os": "alt:///dev/ttyACM0 (found class=os",
         "loop://?x": "loop:// (found x=", "cp2110://x": "cp2110:// and", "tcp://h:1": "a pyserial URL, one of socket:",
     }.items()),
