@@ -45,9 +45,8 @@ def up(
         contacts = _addresses(found.transport(), [program.name for program in wanted])
     names, first = ", ".join(found.skins), next(iter(found.skins))
     print(f"skin {names}: contacts at {contacts}, topics contact/{first} ...")
-    print(
-        "look with `./skin top`, press with `./skin press --x 0.02 --y -0.01 --force 3`, stop with Ctrl-C", flush=True
-    )
+    press = ", press with `./skin press --x 0.02 --y -0.01 --force 3`" * (found.skins[first].port == "stub")
+    print(f"look with `./skin top`{press}, stop with Ctrl-C", flush=True)
     raise typer.Exit(supervise(found, wanted=wanted))
 
 
