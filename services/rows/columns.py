@@ -102,10 +102,11 @@ def _named(arrays: Mapping[str, NDArray[Any]]) -> tuple[Arrays, list[str]]:
             raise InputError(f"`{theirs[0]}` and `{theirs[1]}` may both be `{known}`: name one of them so")
         found[known] = found.pop(theirs[0])
         notes.append(f"`{theirs[0]}` is `{known}`")
-    others = [name for name in found if name not in (*ROWS, "pattern")]
-    if len(others) == 1 and not found.keys() & {"measurements", "touched", "delta"}:
-        found["measurements"] = found.pop(others[0])
-        notes.append(f"`{others[0]}` is `measurements`")
+    numbers = {name for name, each in found.items() if np.asarray(each).dtype.kind in "iufc"}
+    unknown = [*numbers.difference(ROWS, ["pattern"])]
+    if len(unknown) == 1 and not found.keys() & {"measurements", "touched", "delta"}:
+        found["measurements"] = found.pop(unknown[0])
+        notes.append(f"`{unknown[0]}` is `measurements`")
     return found, notes
 
 
