@@ -128,9 +128,10 @@ def test_a_contact_that_changes_is_named_and_left_out_and_makes_no_touch(skin, e
     assert well([skin.rest(BACK_WITHIN + 6)]) and off_m(skin.felt(2, PRESS)[-1], PRESS[0]) < 0.003
 
 
-def test_a_contact_that_stays_as_it_rose_becomes_the_skins_own(skin: StubSkin) -> None:
+@pytest.mark.parametrize(("electrode", "times"), [(0, 1.3), (4, 6.0)])
+def test_a_contact_that_stays_as_it_rose_becomes_the_skins_own(skin: StubSkin, electrode: int, times: float) -> None:
     """After ten seconds; what noise makes of its size is no touch then: electrode 0 shows its impedance least."""
-    electrode, risen = 0, ((0, 1.3),)
+    risen = ((electrode, times),)
     before = skin.felt(250, (), risen)[8:]
     assert all(r.contact.valid and not present(r) for r in before)
     assert all(states(r) == {"drifting": [electrode]} for r in before[:70])

@@ -461,7 +461,7 @@ class BoardFaults:
         if now.contact != change.electrode:
             now.doubt = ContactState()
         now.contact, now.contact_since_s, now.size_before = change.electrode, since_s, before
-        now.size = max(before + n.CONTACT_CHANGES * told, LEAST)
+        now.size = max(before + n.CONTACT_CHANGES * told, self._least_size)
         if now.size > before and not now.doubt.undecided:
             now.doubt.begin(before)
         now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
@@ -503,7 +503,7 @@ class BoardFaults:
             now.doubt.follow(view.at.middle_s, now.size, sd, home)
         self._stays(passed_s)
         now.back_scans = (now.back_scans + whole) if abs(now.size - home) < unsure else 0
-        now.variance += (n.CONTACT_WALK_CHANGED * (1 + now.size)) ** 2 * min(passed_s / SCAN_S, 1.0)
+        now.variance += (n.CONTACT_WALK_CHANGED * self._impedance) ** 2 * min(passed_s / SCAN_S, 1.0)
         drifts = view.at.middle_s < now.doubt.drifts_until_s
         settles_s = n.UNDECIDED_SETTLES_S if now.doubt.undecided else n.CONTACT_SETTLES_S
         back = now.back_scans >= n.BACK_SCANS
@@ -530,7 +530,7 @@ class BoardFaults:
         """For how long it has been still: by its way, as steps from part to part are small however it drifts."""
         now = self.now
         now.still_s += passed_s
-        moves = max(n.CONTACT_STILL * (1 + now.size), now.doubt.unsure) + n.PACE_UNSEEN * now.still_s
+        moves = max(n.CONTACT_STILL * self._impedance, now.doubt.unsure) + n.PACE_UNSEEN * now.still_s
         if abs(now.size - now.still_size) > moves:
             now.still_s, now.still_size = 0.0, now.size
 
@@ -540,8 +540,18 @@ class BoardFaults:
             return
         column = view.spread[:, 0]
         sd = float(np.sqrt(now.variance))
-        now.size = max(now.size + sd * float(column @ answer.weighted_residual), LEAST)
+        now.size = max(now.size + sd * float(column @ answer.weighted_residual), self._least_size)
         now.variance *= max(1 - answer.information(column), 1e-4)
+
+    @property
+    def _impedance(self) -> float:
+        """Of the changed contact, over that at the tare."""
+        return 1 + float(self.now.settled[self.now.contact]) + self.now.size
+
+    @property
+    def _least_size(self) -> float:
+        """Change of a contact that leaves hardly anything of its impedance."""
+        return LEAST * (1 + float(self.now.settled[self.now.contact]))
 
     def drop_contact(self) -> None:
         """No contact has changed."""
