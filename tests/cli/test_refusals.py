@@ -137,7 +137,7 @@ REGISTER = "register in.npz --skin disc16 --out out"
 
 
 @pytest.mark.parametrize(("command", "arrays", "says"), [
-    (RECONSTRUCT, {"pressures": np.ones((2, K))}, "no array `measurements`"),
+    (RECONSTRUCT, {"pressures": np.ones((2, K)), "weights": np.ones((2, K))}, "no array `measurements`"),
     (RECONSTRUCT, ROWS, "found neither"),
     (RECONSTRUCT, {**GOOD, "reference": np.ones((2, K))}, "found both"),
     (RECONSTRUCT, {**GOOD, "measurements": np.ones((2, 119))}, "expected numbers of shape (n, 120)"),
