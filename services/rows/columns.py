@@ -80,15 +80,19 @@ def read_columns(
     for name, each in rows.items():
         rows[name], note = layout.taken(name, each)
         notes.append(note)
-    complex_ = {name for name, each in rows.items() if each.dtype.kind == "c" and each.imag.any()}
-    if complex_ and (real := rows.keys() - complex_):
-        notes.append(f"`{min(real)}` is real beside a complex `{min(complex_)}`, so magnitudes")
+    notes.append(_real_beside_complex(rows))
     if plain is not None and layout.by_default and bundle.matrices.normalisation == "model":
         _doubt(plain, layout)
     if isinstance(options.untouched, int) and options.untouched and "measurements" in rows:
         rows |= _parted(rows["measurements"], options.untouched)
     found.pop("pattern", None)
     return {**found, **rows}, "; ".join(dict.fromkeys(filter(None, notes)))
+
+
+def _real_beside_complex(rows: Mapping[str, NDArray[Any]]) -> str:
+    with_phase = {name for name, each in rows.items() if each.dtype.kind == "c" and each.imag.any()}
+    real = rows.keys() - with_phase
+    return f"`{min(real)}` is real beside a complex `{min(with_phase)}`, so magnitudes" if with_phase and real else ""
 
 
 def _named(arrays: Mapping[str, NDArray[Any]]) -> tuple[Arrays, list[str]]:
