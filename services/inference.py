@@ -1,6 +1,6 @@
 """Inference: from the difference to the image of the conductivity drop, by the bundle's network.
 
-difference -> stack of pre-reconstructions (services/estimation/images/operators.py), a topic too -> image
+difference -> stack of pre-reconstructions (services/estimation/images/reconstruct.py), a topic too -> image
 ONNX Runtime on one thread, warmed up before the stage is ready. A bundle without a network gives the one-step image.
 """
 
@@ -20,9 +20,8 @@ from models.prereconstruction import Operator
 from models.symmetries import symmetries
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch, StackFrame
 from services.describe import ON, symmetry
-from services.estimation.images.averaging import MEANS, sigma_of_mean
-from services.estimation.images.operators import Operators
 from services.estimation.images.quality import Residual
+from services.estimation.images.reconstruct import MEANS, Operators, sigma_of_mean
 from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, Stack, network, nothing
 from services.runtime.config import Skin

@@ -21,9 +21,7 @@ from services.estimation.by_bundle import skin_tables
 from services.estimation.estimator import LAYOUT, Estimator
 from services.estimation.faults import checks
 from services.estimation.faults.advice import sentences
-from services.estimation.images.averaging import sigma_of_mean
-from services.estimation.images.operators import Operators
-from services.estimation.images.reconstruct import Reconstructed, Reconstruction
+from services.estimation.images.reconstruct import Operators, Reconstructed, Reconstruction, sigma_of_mean
 from services.estimation.initialisation.baseline import TAKING, Baseline, NoBaseline, plausible_noise
 from services.estimation.initialisation.references import References
 from services.estimation.tared import KnownBaseline

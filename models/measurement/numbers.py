@@ -1,8 +1,28 @@
-"""Every number of models/measurement that decides something. Lengths in model units unless a unit is said."""
+"""Every number of models/measurement that decides something, and what a number is. Lengths in model units unless a unit
+is said.
+"""
 
 from __future__ import annotations
 
-from models.measurement.number import Number
+from typing import Self
+
+
+class Number(float):
+    """A float that says what it is. origin: "derived: ...", "measured: ...", "data sheet: ..." or "chosen: ..."."""
+
+    unit: str
+    meaning: str
+    origin: str
+
+    def __new__(cls, value: float, unit: str, meaning: str, origin: str) -> Self:
+        made = super().__new__(cls, value)
+        made.unit, made.meaning, made.origin = unit, meaning, origin
+        return made
+
+    def __reduce__(self) -> tuple[type[Self], tuple[float, str, str, str]]:
+        """What a copy is made of."""
+        return type(self), (float(self), self.unit, self.meaning, self.origin)
+
 
 FALSE_ALARM_Z2 = Number(44.0, "-", "z^2 of the best disc that is a touch", "derived: 2 (ln 650 discs + ln 1e6) + 3")
 FIELD_START = Number(1e-5, "-", "the field at the tare", "derived: 64 frames at 80 dB")

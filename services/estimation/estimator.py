@@ -17,7 +17,7 @@ from services.estimation.delayed_update import PendingScan
 from services.estimation.faults import advice
 from services.estimation.faults.board import BoardView, Explanation, PredictedScan
 from services.estimation.faults.wires import WireFault
-from services.estimation.gates.null_gate import Seen
+from services.estimation.gates import Seen
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import (
     AS_IT_IS,
@@ -26,10 +26,11 @@ from services.estimation.hypotheses.innovation import (
     MEMORY,
     NOISE,
     Innovation,
+    Observation,
+    OpenTouch,
     ScoredAnswer,
     StepBudget,
 )
-from services.estimation.hypotheses.observation import Observation, OpenTouch
 from services.estimation.hypotheses.selection import HypothesisSelection
 from services.estimation.initialisation.baseline import NoBaseline
 from services.estimation.initialisation.tare import (

@@ -18,8 +18,7 @@ from services.estimation.faults.board import BoardFaults, FaultState
 from services.estimation.faults.isolation import FaultIsolation
 from services.estimation.faults.table import any_touches
 from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, Memory, SkinFilter
-from services.estimation.gates.null_gate import NullGate
-from services.estimation.gates.slow_onset import SlowOnsetTest, SlowState
+from services.estimation.gates import NullGate, SlowOnsetTest, SlowState
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.initialisation.start import EarlierBaseline
 from services.estimation.initialisation.tare import AgreedScans

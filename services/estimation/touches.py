@@ -36,7 +36,7 @@ from models.measurement.touch import (
     within_limits,
 )
 from services.estimation.filter import Memory
-from services.estimation.hypotheses.observation import Observation
+from services.estimation.hypotheses.innovation import Observation
 from services.estimation.overlap import TrackMotion, gaps
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import TouchEstimate

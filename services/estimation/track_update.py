@@ -9,8 +9,7 @@ import numpy as np
 from models.measurement.fit import FoundTouches
 from models.measurement.touch import LOG_RADIUS
 from services.estimation.filter import Memory
-from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, ScoredAnswer, started_from
-from services.estimation.hypotheses.observation import Observation
+from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer, started_from
 from services.estimation.tared import TaredSkin
 from services.estimation.touches import TouchTracks, TrackedTouch
 from services.estimation.values import numbers as n

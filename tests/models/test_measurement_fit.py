@@ -18,7 +18,7 @@ from models.measurement.covariance.noise import NoiseModel
 from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
 from models.measurement.responses.disc import DiscResponse
-from models.measurement.responses.grid import DiscGrid
+from models.measurement.responses.response import DiscGrid
 from models.measurement.responses.tables import SkinTables, tables_of
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, VX, TouchPrior, X, Y, anywhere, plain
 from models.response_tables import response_tables

@@ -12,7 +12,7 @@ from firmware_stub.analog import Analog, BoardNoise
 from firmware_stub.faults import FAULTS, MUXES, Faults
 from models.measurement.covariance.whitening import Whitening
 from models.measurement.responses.disc import DiscResponse
-from models.measurement.responses.grid import DiscGrid
+from models.measurement.responses.response import DiscGrid
 from models.measurement.responses.tables import SkinTables, tables_of
 from models.patterns import adjacent, pairs
 from models.shapes import Shape

@@ -13,9 +13,8 @@ from models.bundle import Bundle
 from models.calibration_file import found_by
 from models.measurement.numbers import MISFIT, MISFIT_FAR, MISFIT_POWER, TYPICAL_DROP, TYPICAL_RADIUS
 from models.measurement.responses.disc import DiscResponse
-from models.measurement.responses.grid import DiscGrid
 from models.measurement.responses.measured_map import MeasuredMap
-from models.measurement.responses.response import TouchModel
+from models.measurement.responses.response import DiscGrid, TouchModel
 from models.measurement.touch import area_of
 from models.patterns import incidence
 

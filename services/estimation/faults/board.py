@@ -31,8 +31,7 @@ from services.estimation.faults.impedance import (
 from services.estimation.faults.table import BoardScan, WireTable
 from services.estimation.faults.wires import WireFault, WireKind, WireMaps
 from services.estimation.filter import Prediction
-from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, ScoredAnswer
-from services.estimation.hypotheses.observation import Observation
+from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]

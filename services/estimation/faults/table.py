@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from models.measurement.covariance.whitening import Whitening
 from models.measurement.numbers import TYPICAL_DROP
-from models.measurement.responses.grid import DiscGrid
+from models.measurement.responses.response import DiscGrid
 from models.measurement.touch import area_of
 from services.estimation.faults.wires import WireFault, WireMaps, blinded
 from services.estimation.values import numbers as n

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from models.measurement.covariance.noise import BURST_BLOCK
 from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FoundTouches
-from models.measurement.responses.grid import DiscGrid
+from models.measurement.responses.response import DiscGrid
 from services.estimation.hypotheses.innovation import ONSETS, Innovation
 from services.estimation.values import numbers as n
 

@@ -1,18 +1,20 @@
-"""One scan as it is asked about, and an answer: what explains it, scored."""
+"""One scan as it is observed and as it is asked about, and an answer: what explains it, scored."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FoundTouches
-from models.measurement.touch import ACTION, PLACE, TouchPrior, anywhere
+from models.measurement.touch import ACTION, PLACE, RATE, VELOCITY, TouchPrior, anywhere
 from services.estimation.values import numbers as n
+from services.estimation.values.scan import Scan
 
 Array = NDArray[np.float64]
 Priors = Sequence[TouchPrior]
@@ -180,3 +182,88 @@ def likeliest(answers: Sequence[ScoredAnswer]) -> ScoredAnswer:
     explained = [answer for answer in answers if answer.explained]
     apart = [answer for answer in answers if not answer.near]
     return max(explained or apart or answers, key=lambda answer: answer.score)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One scan as it was observed: log |Z|, which measurements count, and when each was taken."""
+
+    scan: Scan
+    log_z: Array  # (K,) 0 where a measurement does not count
+    live: NDArray[np.bool_]  # (K,)
+    whole: bool  # it shares no value with the last one that was whole
+    budget: StepBudget
+
+    @property
+    def span_s(self) -> float:
+        return self.scan.duration_s
+
+    @property
+    def middle_s(self) -> float:
+        return self.scan.at_ns * 1e-9 - self.scan.duration_s / 2
+
+    @property
+    def oldest_s(self) -> float:
+        return self.middle_s - self.span_s / 2
+
+    @property
+    def end_s(self) -> float:
+        return self.middle_s + self.span_s / 2
+
+    @property
+    def sample_s(self) -> float:
+        """For when what touches is said, from the middle of the scan on."""
+        return self.scan.sample_ns * 1e-9 - self.middle_s
+
+    @property
+    def times_s(self) -> Array:
+        """(K,) from the middle of the scan."""
+        return self.span_s / 2 - self.scan.ages_s
+
+    @cached_property
+    def order(self) -> NDArray[np.intp]:
+        """(K,) rank in time, 0 the oldest."""
+        return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
+
+    def innovation(
+        self,
+        y: Array,
+        covariance: Array,
+        live: NDArray[np.bool_],
+        information: NDArray[np.float32],
+        candidates: tuple[TouchPrior, ...],
+        places: tuple[int, ...] = (),
+    ) -> Innovation:
+        """About this scan."""
+        return Innovation(
+            y=y,
+            covariance=covariance,
+            live=live,
+            times_s=self.times_s,
+            span_s=self.span_s,
+            sample_s=self.sample_s,
+            order=self.order,
+            part=self.scan.part,
+            information=information,
+            budget=self.budget,
+            candidates=candidates,
+            places=places,
+            by_evidence=self.whole,
+        )
+
+
+@dataclass(frozen=True)
+class OpenTouch:
+    """A touch that nearly explained the last scan, or did so and is not sure."""
+
+    state: Annotated[Array, "states"]
+    since_s: float  # host's clock
+    id: int = 0  # of the one that it continues; 0: none
+
+    def begun(self, measured: Observation) -> TouchPrior:
+        """Anywhere in the next scan, searched from where it was at the end of that one: how it goes on nobody knows."""
+        state, half_s = self.state.copy(), measured.span_s / 2
+        state[PLACE] += half_s * state[VELOCITY]
+        state[ACTION] += half_s * state[RATE]
+        state[RATE:] = 0.0
+        return begun_at(state, measured.span_s, self.since_s - measured.middle_s)

@@ -10,8 +10,14 @@ import numpy as np
 from models.measurement.responses.tables import SkinTables
 from services.estimation.filter import Prediction
 from services.estimation.hypotheses.hypotheses import Hypotheses
-from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Priors, ScoredAnswer, StepBudget
-from services.estimation.hypotheses.observation import Observation
+from services.estimation.hypotheses.innovation import (
+    AS_IT_IS,
+    Innovation,
+    Observation,
+    Priors,
+    ScoredAnswer,
+    StepBudget,
+)
 from services.estimation.hypotheses.split_merge import SplitMergeTest
 from services.estimation.tared import TaredSkin
 from services.estimation.values import numbers as n

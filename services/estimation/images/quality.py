@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.prereconstruction import Drift
-from services.estimation.images.averaging import MEANS, sigma_of_mean
+from services.estimation.images.reconstruct import MEANS, sigma_of_mean
 
 KEPT = 10  # noises of frames whose matrices are kept, 0.3 MB each
 MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through

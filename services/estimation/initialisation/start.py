@@ -6,6 +6,9 @@ ladder of factors of two. Either that explains the scans, or a touch explains wh
 is so large that a touch may hide in it, nothing is said.
 
 With an earlier baseline of this very skin both have that difference, and only what drifts meanwhile is free.
+
+Whether the board's wires are as they belong is judged alike: what each fault of the wires would make of the bundle's
+skin is held against what sound wires show, both with all that a skin may differ by and with any touches.
 """
 
 from __future__ import annotations
@@ -23,6 +26,8 @@ from models.measurement.covariance.whitening import Whitening, leave_out
 from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
 from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import PLACE, RATE, TouchPrior, anywhere
+from services.estimation.faults.table import BoardScan, WireTable, any_touches
+from services.estimation.faults.wires import WireFault, WireMaps
 from services.estimation.values import numbers as n
 from services.estimation.values.judgement import Judgement, Verdict, judge
 
@@ -211,3 +216,50 @@ def decided(rungs: list[Rung]) -> JudgedStart:
     if odds < 0 and bare.seen > n.FALSE_ALARM_Z2:
         return JudgedStart(StartSays.UNTOUCHED, odds, False, bare, None)
     return JudgedStart(StartSays.UNKNOWN, odds, False, bare, None)
+
+
+class WiringTest:
+    """Which fault of the wires explains the first scans. tables: of the skin's bundle."""
+
+    def __init__(self, tables: SkinTables) -> None:
+        self.maps = WireMaps(tables.pattern)
+        self._tables, self._table = tables, WireTable(self.maps)
+        self._covariances: list[Array] = []  # (K, K) of an untouched or touched skin, for differences of each size
+
+    def __call__(self, log_z: Array, variance: Array, live: NDArray[np.bool_]) -> WireFault | None:
+        """log_z (K,): mean of the first scans; variance (K,): of that mean; live (K,): what of it counts."""
+        if not self.maps.knows or not self._tables.predicted or live.mean() < n.LEAST_LIVE:
+            return None
+        expected = np.log(self._tables.z0)
+        predicted = expected + float(np.median((log_z - expected)[live]))
+        times_s = np.zeros(len(log_z))
+        scan = BoardScan(np.where(live, log_z, 0.0), predicted, ~live, np.ones_like(live), times_s, 1.0)
+        if not self._table.suspicious(scan, None):
+            return None
+        if not self._covariances:
+            self._covariances = covariances(self._tables)
+        own = np.diag(np.where(live, variance, 1.0))
+        best = dict[WireFault | None, float]()
+        for times, covariance in zip(LADDER, self._covariances, strict=True):
+            for guess in self._table.guesses(scan, None, covariance, own):
+                score = guess.score - float(np.log(times))
+                best[guess.fault] = max(best.get(guess.fault, -np.inf), score)
+        return likeliest(best)
+
+
+def likeliest(score: dict[WireFault | None, float]) -> WireFault | None:
+    """The fault that is surely likelier than sound wires and than every other."""
+    first, *others = sorted(score, key=lambda fault: -score[fault])
+    if first is None or score[first] < score[None] + n.WIRE_SURE:
+        return None
+    apart = all(score[first] > score[other] + n.WIRE_APART for other in others)
+    return first if apart else None
+
+
+def covariances(tables: SkinTables) -> list[Array]:
+    """(K, K) of log |Z| over what a skin and its bundle differ by, of each size, and touches anywhere."""
+    contact = tables.contact * n.START_CONTACT
+    base = contact @ contact.T + n.START_GAIN**2 + any_touches(tables.grid)
+    base += n.START_FIELD**2 * smooth_field(tables) + n.START_GRAIN**2 * grain(tables)
+    form = n.START_LAYER**2 * tables.layer @ tables.layer.T + n.START_ABSOLUTE**2 * np.eye(len(base))
+    return [base + times**2 * form for times in LADDER]

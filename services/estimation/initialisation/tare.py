@@ -21,8 +21,13 @@ from services.estimation.initialisation.baseline import (
     measured,
     untrained,
 )
-from services.estimation.initialisation.start import EarlierBaseline, JudgedStart, StartSays, TouchAtStartTest
-from services.estimation.initialisation.wiring import WiringTest
+from services.estimation.initialisation.start import (
+    EarlierBaseline,
+    JudgedStart,
+    StartSays,
+    TouchAtStartTest,
+    WiringTest,
+)
 from services.estimation.values import numbers as n
 from services.estimation.values.judgement import Judgement, judge
 from services.estimation.values.scan import Scan

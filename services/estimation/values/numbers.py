@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from models.measurement.number import Number
-from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START
+from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START, Number
 
 __all__ = ["CONTACT_START", "FALSE_ALARM_Z2", "FIELD_START"]  # beside this module's own
 

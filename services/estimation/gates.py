@@ -1,9 +1,10 @@
-"""A first look at a scan by what one of a moment ago told: it costs a product with a vector where nothing touches, and
-one warm fit where touches stay as they are. It only says that all goes on; what does not goes the whole way.
+"""Looks at a scan that cost little, by what was known a moment ago: whether all goes on, and whether a touch came so
+slowly that the filter took it for drift.
 """
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 from models.measurement.covariance.noise import BURST_BLOCK
 from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import KnownWhitening, Turned
-from models.measurement.responses.grid import DiscGrid
+from models.measurement.responses.response import DiscGrid
+from services.estimation.filter import FilterState, SkinFilter
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, ScoredAnswer
 from services.estimation.values import numbers as n
 from services.estimation.values.scan import Scan
@@ -139,3 +141,40 @@ class NullGate:
         z2 = max(self._grid.likeliest(weighted_residual, information)[0], fresh)
         even = float(weighted_residual.sum()) ** 2 / known.told_of_even < n.GAIN_Z2
         return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, z2, weighted_residual, y)
+
+
+@dataclass
+class SlowState:
+    """All that changes."""
+
+    kept: list[FilterState] = field(default_factory=list)  # oldest first
+    looked_s: float = 0.0  # when it was asked last
+
+
+class SlowOnsetTest:
+    """Of one skin, while nothing touches: holds scans against the filter as it was some seconds ago, a fixed lag."""
+
+    def __init__(self, drift: SkinFilter) -> None:
+        self._drift = drift
+        self.now = SlowState()
+
+    def forget(self) -> None:
+        """Something touches: what was before tells nothing of what drifts."""
+        self.now = SlowState()
+
+    def keep(self) -> None:
+        """The filter has learnt from an untouched scan."""
+        kept, filtered = self.now.kept, self._drift.now
+        if kept and 0 <= filtered.at_s - kept[-1].at_s < n.SLOW_S / 2:
+            return
+        kept.append(deepcopy(filtered))
+        while len(kept) > 1 and filtered.at_s - kept[1].at_s >= n.SLOW_S:
+            del kept[0]
+
+    def due(self, at_s: float) -> SkinFilter | None:
+        """The filter as it was, when it is time to look."""
+        now = self.now
+        if not now.kept or at_s - now.kept[0].at_s < n.SLOW_S or 0 <= at_s - now.looked_s < n.SLOW_EVERY_S:
+            return None
+        now.looked_s = at_s
+        return self._drift.as_it_was(now.kept[0])
