@@ -25,8 +25,7 @@ from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 
-ASKED = (2, 3, 4, 6, 8, 12, 16, 24, 32)  # scans since the change at which it is asked, and every EVERY from then on
-EVERY = 16
+EVERY = 16  # scans from asking to asking, once those since the change have doubled so often: at 2, 4, 8, 16, 32, 48 ...
 SETTLES = 3  # whole scans in which a change may go on
 
 
@@ -47,7 +46,7 @@ class ContactOrTouchTest:
         if not doubt.undecided or found.answer.cause not in (AS_IT_IS, MEMORY) or self._changes(view):
             return None
         doubt.add(self._over(view, found.answer))
-        if doubt.scans not in ASKED and (doubt.scans < ASKED[-1] or doubt.scans % EVERY):
+        if doubt.scans == 1 or (doubt.scans % EVERY and doubt.scans & (doubt.scans - 1)):
             return None
         assert doubt.over is not None
         y = np.where(view.live, doubt.over / doubt.scans, 0.0)
