@@ -60,6 +60,7 @@ class FaultIsolation:
             innovation = innovation_of(hypotheses, view, view.covariance(skin, own))
             return Explanation(view, innovation, recounting(hypotheses, innovation, selecting(hypotheses, innovation)))
 
+        before = faults.now.wire, faults.now.wire_since_s
         view = faults.look(at)
         if faults.now.wire is None and rewired(view):
             view = faults.look(at)
@@ -71,6 +72,8 @@ class FaultIsolation:
             found = self._lifted(found, lambda: asked(faults.look(at)))
         if faults.asks(found.answer):
             found = self._changed(found, at, *self._change(standing, at), selecting)
+        if not found.answer.nearly_holds:  # what does not explain its scan would stand beside any touch in the next one
+            faults.now.wire, faults.now.wire_since_s = before
         return self._doubted(found, at)
 
     def _lifted(self, found: Explanation, ask: Callable[[], Explanation]) -> Explanation:
