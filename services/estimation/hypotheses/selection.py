@@ -33,6 +33,8 @@ class HypothesisSelection:
         self._tables, self._skin, self._measured = tables, skin, measured
         self._predicted, self._unexplained_s = predicted, unexplained_s
         self._searched = False  # anew, whatever stands: once, it costs four scans' steps
+        scans = round(unexplained_s / measured.span_s)
+        self._due = not scans & (scans - 1)  # ever more seldom while nothing explains them, at 1, 2, 4, 8 ... scans
 
     def answer(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """The likeliest one."""
@@ -60,7 +62,7 @@ class HypothesisSelection:
         """What is asked of a whole scan before all else."""
         if not self._measured.whole:
             return
-        if self._unexplained_s > 0 and not self._searched:
+        if self._unexplained_s > 0 and self._due and not self._searched:
             self._searched = True  # they may be others than those that stand
             yield self._from_nothing(hypotheses, innovation)
         if hypotheses.wide:
@@ -84,6 +86,8 @@ class HypothesisSelection:
             return answer
         scan = self._measured.scan
         if not (_strained(answer) or self._skin.touches.odd or scan.separate):
+            return answer
+        if not (answer.explained or self._due):
             return answer
         own = replace(innovation, budget=StepBudget.of(1.0, scan.separate), keeps=0.0, by_evidence=True)
         recount = SplitMergeTest(hypotheses, scan.separate)
