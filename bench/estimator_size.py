@@ -8,33 +8,30 @@ import ast
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, TypeGuard
+from typing import NamedTuple
 
 from bench import ROOT
 from simulation.host import SimulatedHost, tared
 
 AREAS = ("services/estimation", "models/measurement")
-HANGS_ON = (
-    "services/contacts",
-    *(f"services/{name}.py" for name in ("preprocessing", "inference", "publisher", "pipeline", "judged", "describe")),
-    *(f"services/{name}.py" for name in ("networks", "symmetry", "mounting", "linearisation", "health", "folders")),
-    *(f"models/{name}.py" for name in ("locator", "locator_arrays", "pressure", "response_file", "response_tables")),
-)
+STAGES = "preprocessing inference publisher pipeline judged describe networks symmetry mounting linearisation health"
+SKIN = "locator locator_arrays pressure response_file response_tables"
+HANGS_ON = ("services/contacts", "services/folders.py", *(f"services/{name}.py" for name in STAGES.split()))
+HANGS_ON += tuple(f"models/{name}.py" for name in SKIN.split())
 FREE = (0, 1, 2, 0.5)  # decide nothing by themselves
-DERIVED = "derived"
-LITERAL = "literal"
+DERIVED, LITERAL = "derived", "literal"
 REST_S = 1.0
 
 
 class Decides(NamedTuple):
     """A number that decides something."""
 
-    name: str  # or the line that a literal stands in
+    where: str
+    name: str  # of what its expression makes
     value: float
     unit: str
-    origin: str  # "class: where it comes from"; LITERAL: it says nothing
-    meaning: str
-    where: str
+    meaning: str  # of a literal: its line
+    origin: str  # "class: where it comes from", or LITERAL
 
     @property
     def kind(self) -> str:
@@ -51,53 +48,40 @@ def lines(of: list[Path]) -> int:
     return sum(len(file.read_text().splitlines()) for file in of)
 
 
-def numbers() -> list[Decides]:
+def numbers(of: list[Path]) -> list[Decides]:
     """Entries of the tables, then every further literal but FREE ones and indices."""
-    found = [number for file in files() for number in _of_file(file)]
-    return sorted(found, key=lambda number: number.kind == LITERAL)
+    found = [each for file in of for each in _below(ast.parse(file.read_text()), file, "")]
+    return sorted(found, key=lambda each: each.kind == LITERAL)
 
 
 def not_derived(found: list[Decides]) -> int:
     return sum(number.kind != DERIVED for number in found)
 
 
-def _of_file(file: Path) -> Iterator[Decides]:
-    source, name = file.read_text(), str(file.relative_to(ROOT))
-    lines_of_file = source.splitlines()
-    for each in _below(ast.parse(source), ""):
-        line = int(each.where)
-        meaning = each.meaning or lines_of_file[line - 1].strip()
-        yield each._replace(meaning=meaning, where=f"{name}:{line}")
-
-
-def _below(node: ast.AST, label: str) -> Iterator[Decides]:
-    """Of a node; label: what the value is called in whose expression it stands."""
+def _below(node: ast.AST, file: Path, name: str) -> Iterator[Decides]:
+    """Of a node; name: of what the expression makes that it stands in."""
+    where = f"{file.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}"
     if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-        label = node.targets[0].id
+        name = node.targets[0].id
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Number":
         value, *texts = (ast.literal_eval(each) for each in node.args)
-        unit, meaning, origin = map(str, texts)
-        yield Decides(label, float(str(value)), unit, origin, meaning, str(node.lineno))
+        yield Decides(where, name, float(str(value)), *map(str, texts))
         return
-    if isinstance(node, ast.Constant) and _is_number(node.value) and node.value not in FREE:
-        yield Decides(label, float(node.value), "", LITERAL, "", str(node.lineno))
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
+        if node.value not in FREE:
+            line = file.read_text().splitlines()[node.lineno - 1].strip()
+            yield Decides(where, name, float(node.value), "", line, LITERAL)
     index = node.slice if isinstance(node, ast.Subscript) else None
     for child in ast.iter_child_nodes(node):
         if child is not index:
-            yield from _below(child, label)
-
-
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+            yield from _below(child, file, name)
 
 
 def files_of_scans() -> dict[str, set[str]]:
-    """Modules of services and models with a function that runs for a whole scan: one where nothing touches, and those
-    until a touch that begins is shown.
-    """
+    """Modules of services and models that run for a whole scan where nothing touches, and until a touch is shown."""
     host = tared("full", snr_db=80.0, seed=1)
     host.until(host.now + REST_S)
-    quiet = _run_through(host, until=len(host.contacts) + 1)
+    quiet = _run_through(host, len(host.contacts) + 1)
     host.press(x=0.01, y=-0.01, force=2.0)
     host.contacts.clear()
     return {"quiet": quiet, "touched": _run_through(host)}
@@ -114,7 +98,3 @@ def _run_through(host: SimulatedHost, until: int = 0) -> set[str]:
         sys.setprofile(None)
     names = {str(Path(name).relative_to(ROOT)) for name in seen if Path(name).is_relative_to(ROOT)}
     return {name for name in names if name.startswith(("services/", "models/"))}
-
-
-def of_estimator(names: set[str]) -> set[str]:
-    return {name for name in names if name.startswith(AREAS)}

@@ -61,7 +61,7 @@ def numbers() -> None:
     """Every number of the estimator that decides something: its tables, and literals elsewhere."""
     from bench import estimator_size
 
-    found = estimator_size.numbers()
+    found = estimator_size.numbers(estimator_size.files())
     for each in found:
         print(f"{each.where:58} {each.name:24} {each.value:<10g} {each.unit:8} {each.meaning}  [{each.origin}]")
     kinds = Counter(each.kind for each in found)
@@ -75,9 +75,9 @@ def size() -> None:
     own, more = of.files(), of.files(of.HANGS_ON)
     print(f"{of.lines(own)} lines in {len(own)} files of {' and '.join(of.AREAS)}")
     print(f"{of.lines(own + more)} with stages, contacts, mounting, locator and response files")
-    print(f"{of.not_derived(of.numbers())} numbers that are not derived from others")
+    print(f"{of.not_derived(of.numbers(own))} numbers that are not derived from others")
     for scan, names in of.files_of_scans().items():
-        within = len(of.of_estimator(names))
+        within = sum(name.startswith(of.AREAS) for name in names)
         print(f"a {scan} whole scan runs through {len(names)} files, {within} of them of the estimator")
 
 
