@@ -22,6 +22,7 @@ from models.command import real
 from models.forward import ForwardModel
 from models.prereconstruction import Array, PreReconstructor
 from models.shapes import Shape, drop_image
+from protocol.whole_file import whole_file
 from services.recordings.npz_file import Input
 from services.recordings.reconstruction import find_skin, reconstruct
 
@@ -75,7 +76,8 @@ def main(argv: list[str] | None = None) -> int:
     scale.set_label("conductivity drop, S/m", fontsize=15)
     scale.ax.tick_params(labelsize=13)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(options.out, dpi=95)
+    with whole_file(options.out) as part:
+        figure.savefig(part, dpi=95)
     print(f"{options.out}: noise {options.snr:g} dB, the sheet is 100 mm wide")
     return 0
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from models.evaluation import LEVELS
+from protocol.whole_file import whole_file
 
 STARVED = 0.7  # of the processor time that its threads could have had: below, other programs had the rest
 MUCH = 0.4  # share of the time from which making batches, or held-out checks, is what to look at
@@ -135,5 +136,6 @@ def plot(curve: list[dict[str, Any]], path: Path) -> None:
         axis.legend(fontsize=7)
         axis.grid(alpha=0.3)
     figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=110)
     plt.close(figure)
