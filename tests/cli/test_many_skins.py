@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -43,7 +44,7 @@ class Service:
 
     def skin(self, words: str, code: int | None = 0) -> str:
         """What a command prints: on both streams, where it is to fail."""
-        ran = self.call(*words.split(), "--runtime", self.folder)
+        ran = self.call(*shlex.split(words), "--runtime", self.folder)
         assert code in (None, ran.code), (words, ran)
         return ran.out + (ran.err if code else "")
 
@@ -155,7 +156,7 @@ def test_the_doctor_names_what_differs_from_what_runs(service: Service) -> None:
     (service.folder / "palm.json").write_text('{"newtons_per_siemens": 8.5}')
     changed.write_text(before.replace('bundle = "square16"', 'bundle = "disc16"\ncalibration = "palm.json"'))
     for other in (ROOT / "skin.toml", changed):
-        said = service.skin(f"doctor --config {other}")
+        said = service.skin(f"doctor --config {shlex.quote(str(other))}")
         assert f"the service runs {config}" in said and "FAIL" not in said and "restart the service:" not in said
     config.write_text(changed.read_text())
     try:
