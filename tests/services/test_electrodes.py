@@ -193,14 +193,12 @@ def on_electrode(electrode: int, inside: float, along: float, radius: float, dro
 @pytest.mark.parametrize("ramp", [1, 4, 9])
 @pytest.mark.parametrize("touch", ON_ELECTRODES)
 def test_a_touch_right_on_an_electrode_is_no_drifting_contact(skin: StubSkin, touch: Any, ramp: int) -> None:
-    """It is shown, or the frame says that it may be a contact and is not valid: never is it hidden in a valid one, but
-    while it is lighter than what most places show. All press with some 0.1 N.
-    """
+    """It is shown, or the frame says that it may be a contact and is not valid: never is it hidden in a valid one."""
     free, pressed, seen = transfer(), transfer((on_electrode(*touch),)), False
     forces = [*np.linspace(0, 1, ramp + 1)[1:], *[1.0] * 30, *np.linspace(1, 0, ramp + 1)[1:], *[0.0] * 6]
     for k, force in enumerate(forces):
         result = skin.see(free + force * (pressed - free))
-        assert not (result.contact.valid and result.delta.electrodes.any() and force > 0.7), force
+        assert not (result.contact.valid and result.delta.electrodes.any()), force
         seen |= "electrode_drift" in result.contact.reasons or bool(present(result))
         if ramp <= k < ramp + 30:
             assert present(result) or not result.contact.valid or "changing" in result.contact.reasons, k

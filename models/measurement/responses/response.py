@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from models.measurement.covariance.whitening import Whitening
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 
 class TouchModel(Protocol):
@@ -32,9 +33,6 @@ class TouchModel(Protocol):
     def discs(self) -> Array:
         """(A, 3) x, y, log radius: where something may touch."""
         ...
-
-
-Single = NDArray[np.float32]
 
 
 class DiscGrid:

@@ -2,8 +2,7 @@
 
 The scans since the change are averaged, touches that stand taken off, and both are asked: a contact of any size, and a
 touch there with what discs miss of it at second order. A touch has more figures, so a light one is worth up to 18 nats
-less than a contact that is none; a contact that is one gains with each scan. What neither decides stays not valid, but
-where the touch would be so light that it would not be seen elsewhere.
+less than a contact that is none; a contact that is one gains with each scan. What neither decides stays not valid.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from models.measurement.covariance.whitening import leave_out
 from models.measurement.fit import FoundTouches
 from models.measurement.responses.tables import SkinTables
-from models.measurement.touch import ACTION
 from services.estimation.faults.board import LEAST, BoardFaults, BoardView, Explanation
 from services.estimation.faults.impedance import ContactChange, ContactColumns, Unexplained
 from services.estimation.hypotheses.hypotheses import Hypotheses
@@ -64,7 +62,7 @@ class ContactOrTouchTest:
             return None
         touch = self._touch(asked)
         odds = contact.score - touch.score
-        if odds > n.CONTACT_TOLD or (odds > n.FAULT_SURE and _unseen(found.innovation, touch)):
+        if odds > n.CONTACT_TOLD:
             doubt.end(faults.size)
         elif odds < -n.TOUCH_TOLD and touch.explained:
             return touch.fit
@@ -100,10 +98,3 @@ class ContactOrTouchTest:
         columns: ContactColumns = self._faults.columns
         second = n.TOUCH_SECOND * np.column_stack([columns.layer[:, k], columns.rest[:, k]])
         return self._hypotheses.on_electrode(asked, self._tables.places[k], second)
-
-
-def _unseen(innovation: Innovation, touch: ScoredAnswer) -> bool:
-    """Whether a touch acts by so little that at many places no scan would show it."""
-    assert touch.fit is not None
-    least = float(np.quantile(innovation.information, n.START_SEEN_SHARE))
-    return float(touch.fit.states[0, ACTION]) ** 2 * least < n.FALSE_ALARM_Z2

@@ -28,7 +28,8 @@ def sigma_of_mean(sigma: NDArray[np.float32], n: int) -> NDArray[np.float32]:
 
 
 class FrameAverager:
-    """Decides which frames of a touch are reconstructed, and from what.
+    """Decides which frames of a touch are reconstructed, and from what: those since it last changed, by the whitened
+    energy of an image's operator. The limit allows for the noise having been estimated from few scans.
 
     While nothing changes against the frame last reconstructed (not the previous frame: creep must be seen), frames are
     averaged, and their mean is reconstructed after 2, 4, 8, 16, 32, 48 ... of them.
