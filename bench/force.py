@@ -23,8 +23,7 @@ from rich.console import Console
 from bench import REPORTS
 from bench.force_presses import LIVE_SNR_DB, NEWTONS, RADII_MM, SIDE_M, PressRow, live, simulated
 from bench.goals import Goal, table
-from bench.json_file import drawn, write_json
-from bench.machine import provenance
+from bench.json_file import write_report
 from models.command import real, whole
 from models.fisher import MeasurementNoise, floors, mean_floor
 from models.force_limits import SIZES
@@ -126,18 +125,8 @@ def main(argv: list[str] | None = None) -> int:
         wanted += goals(scan, [r for r in rows if r.scan == scan], own)
         _print(scan, own)
     Console().print(table(wanted))
-    report = {
-        **provenance("force", argv),
-        "snr_db": args.snr,
-        "seed": args.seed,
-        "cells": of,
-        "targets": [goal.to_dict() for goal in wanted],
-        "presses": [asdict(r) for r in rows],
-    }
-    path = args.out / ("force_live.json" if args.live else "force.json")
-    write_json(path, report)
-    drawn(path)
-    print(f"wrote {path}")
+    report = {"snr_db": args.snr, "seed": args.seed, "cells": of, "presses": [asdict(r) for r in rows]}
+    write_report(args.out / f"force{'_live' if args.live else ''}.json", argv, wanted, report)
     return 0
 
 

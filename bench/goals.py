@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -53,6 +53,14 @@ class Goal:
     @classmethod
     def from_dict(cls, found: dict[str, Any]) -> Goal:
         return cls(found["figure"], found["value"], found.get("at_most"), found.get("at_least"))
+
+
+def titled(title: str, headings: Iterable[str], words: int = 1) -> Table:
+    """Without rows yet. words: how many columns, the first ones, hold no numbers."""
+    made = Table(title=title, title_justify="left")
+    for place, heading in enumerate(headings):
+        made.add_column(heading, justify="left" if place < words else "right")
+    return made
 
 
 def table(goals: Sequence[Goal]) -> Table:

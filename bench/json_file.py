@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import models
+from bench.goals import Goal
+from bench.machine import provenance
 from protocol.whole_file import write_whole
 
 
@@ -16,6 +18,17 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Writes a report; its folder is made where there is none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, json.dumps(_strict(dict(content)), indent=1, allow_nan=False) + "\n")
+
+
+def write_report(
+    path: Path, arguments: Sequence[str] | None, goals: Sequence[Goal], found: Mapping[str, Any], picture: bool = True
+) -> None:
+    """Of the benchmark that the file is named after: how it was made, its figures, what it found; and the picture."""
+    head = provenance(path.stem.removesuffix("_live"), arguments)
+    write_json(path, {**head, "targets": [goal.to_dict() for goal in goals], **found})
+    if picture:
+        drawn(path)
+    print(f"wrote {path}")
 
 
 def drawn(report: Path) -> None:

@@ -1,8 +1,6 @@
-"""Stages that stand still, or read only the newest of the frames that come, as where a machine is too slow."""
+"""Stages of which one may stand still, as where its process is stopped."""
 
 from __future__ import annotations
-
-from collections import Counter
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame, Frame, ImageFrame, PartFrame, RawFrame
@@ -14,16 +12,14 @@ STAGES = "Preprocessing", "Inference", "Publishing"
 
 
 class HaltingPipeline(Pipeline):
-    """`every`: by a stage's name, of how many frames that come it reads the newest; 0: it stands still. As in
-    protocol/sockets.py:StageReader the frame is read too whose stack or image that one holds, and no part of an image
-    that was not.
+    """`still`: the name of the stage that stands still, if any. As in protocol/sockets.py:StageReader the frame is read
+    later whose stack or image a newer one holds, and no part of an image that was not.
     """
 
     def __init__(self, skin: Skin, name: str = "palm", bundle: Bundle | None = None) -> None:
         super().__init__(skin, name, bundle)
-        self.every: dict[str, int] = {}
+        self.still = ""
         self.names: dict[Stage, str] = dict(zip((self.pre, self.inference, self.publishing), STAGES, strict=True))
-        self._came: Counter[str] = Counter()
         self._seen = -1  # scan of the image that publisher read last
         self._holder: dict[str, DeltaFrame | ImageFrame] = {}  # that came last, by the stage that did not read it
 
@@ -38,7 +34,7 @@ class HaltingPipeline(Pipeline):
             return [frame]
         if isinstance(frame, PartFrame) and frame.after != self._seen:
             return []
-        if not self._reads(stage, frame):
+        if self.names[stage] == self.still:
             if isinstance(frame, DeltaFrame | ImageFrame) and not frame.held:
                 self._holder[self.names[stage]] = frame
             return []
@@ -48,12 +44,6 @@ class HaltingPipeline(Pipeline):
         if self.publishing.lacks:
             self.inference.joined("image")
         return made
-
-    def _reads(self, stage: Stage, frame: Frame) -> bool:
-        name = self.names[stage]
-        self._came[name] += not isinstance(frame, PartFrame)
-        every = self.every.get(name, 1)
-        return every > 0 and self._came[name] % every == 0
 
     def _held(self, stage: Stage, frame: Frame) -> list[Frame]:
         """What the stage makes of the frame before that this one stands on, where that was not read."""

@@ -136,9 +136,9 @@ class SimulatedHost:
         """
         self.until(start)
         if isinstance(self.pipeline, HaltingPipeline) and how in self.pipeline.names.values():
-            self.pipeline.every = {how: 0}
+            self.pipeline.still = how
             self.until(start + seconds)
-            self.pipeline.every = {}
+            self.pipeline.still = ""
             return
         name, args = ("sequence_gaps", {"fraction": 1.0}) if how == "lost" else (how, {})
         self.rig.fault(name, args, start, seconds)

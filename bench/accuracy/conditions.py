@@ -16,6 +16,7 @@ from rich.table import Table
 
 from bench.accuracy.frames import NOISE_FREE, SKIN
 from bench.accuracy.scores import METRES_PER_UNIT
+from bench.goals import titled
 from models import geometry, meshing, metrics
 from models.bundle import Bundle
 from models.forward import ForwardModel, shared
@@ -112,9 +113,8 @@ def run(quick: bool, seed: int) -> list[dict[str, Any]]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
-    made = Table(title="eight touches under worse conditions, 70 dB unless it says otherwise", title_justify="left")
-    for heading in ("condition", "", "rows", "valid %", "not shown", "position, % of the side", "largest", "force %"):
-        made.add_column(heading, justify="left" if heading in ("condition", "") else "right")
+    headings = "condition", "", "rows", "valid %", "not shown", "position, % of the side", "largest", "force %"
+    made = titled("eight touches under worse conditions, 70 dB unless it says otherwise", headings, 2)
     for row in rows:
         cells = ["" if row[k] is None else f"{row[k]:.2f}" for k in ("position_%", "position_max_%", "force_%")]
         counts = str(row["rows"]), f"{row['valid_%']:.0f}", str(row["missed"])

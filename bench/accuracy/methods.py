@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from bench.accuracy import peers as _peers
 from models import baselines
 from models.bundle import Bundle
 from models.forward import ForwardModel
-from models.prereconstruction import THRESHOLD_T, noise_of_frames
+from models.prereconstruction import THRESHOLD_T, Operator, noise_of_frames
 from models.shapes import Array
 from services.runtime.config import Skin
 
@@ -56,48 +57,46 @@ class Method:
     slow: bool = False
 
 
-def _difference(method: Callable[[Array], Array], z0: Array) -> Image:
-    return lambda z: method(z / z0 - 1)
+def _linear(
+    name: str,
+    make: Callable[[float | None], Callable[[Array], Array]],
+    values: tuple[float, ...] = (),
+    pattern: str = "pairs",
+    slow: bool = False,
+) -> Method:
+    """Of relative differences. What `make` makes of a hyperparameter is made once."""
+    made = cache(make)
+
+    def build(tare: Tare, value: float | None) -> Image:
+        method, z0 = made(value), tare.pairs0 if pattern == "pairs" else tare.adjacent0
+        return lambda z: method(z / z0 - 1)
+
+    return Method(name, build, values, pattern, slow=slow)
 
 
 def classical() -> list[Method]:
     """The baselines of models/baselines.py, each also with its hyperparameter tuned to the noise."""
     physics = baselines.PeerPhysics(ForwardModel("square16", mesh="inverse"))
-    made: dict[tuple[str, float | None], Callable[[Array], Array]] = {}
-
-    def row(
-        name: str,
-        make: Callable[[float | None], Callable[[Array], Array]],
-        values: tuple[float, ...] = (),
-        slow: bool = False,
-    ) -> Method:
-        def build(tare: Tare, value: float | None) -> Image:
-            if (name, value) not in made:
-                made[name, value] = make(value)
-            return _difference(made[name, value], tare.pairs0)
-
-        return Method(name, build, values, slow=slow)
-
     return [
-        row("NOSER, lambda 0.15 (published)", lambda v: baselines.noser(physics, n=N)),
-        row(
+        _linear("NOSER, lambda 0.15 (published)", lambda v: baselines.noser(physics, n=N)),
+        _linear(
             "NOSER, best lambda",
             lambda v: baselines.noser(physics, v or 0.01, n=N, units="relative"),
             (1e-3, 3e-3, 0.01, 0.03, 0.1),
         ),
-        row(
+        _linear(
             "total variation",
             lambda v: baselines.TotalVariation(physics, v or 1e-6),
             (1e-8, 1e-7, 1e-6, 4e-6, 2e-5),
             slow=True,
         ),
-        row(
+        _linear(
             "Gauss-Newton, 3 steps",
             lambda v: baselines.GaussNewton(physics, v or 0.01, n=N, steps=3),
             (1e-3, 3e-3, 0.01, 0.03, 0.1),
             slow=True,
         ),
-        row("GREIT", lambda v: baselines.greit(physics, n=N, noise_figure=v or 1.0), (0.5, 1.0, 2.0, 4.0)),
+        _linear("GREIT", lambda v: baselines.greit(physics, n=N, noise_figure=v or 1.0), (0.5, 1.0, 2.0, 4.0)),
     ]
 
 
@@ -105,15 +104,9 @@ def peers() -> list[Method]:
     """pyEIT's three, on the adjacent pattern's frames; none where it is not installed."""
     if not _peers.installed():
         return []
-    made: dict[tuple[str, float | None], _peers.PyEIT] = {}
 
     def row(label: str, method: str, values: tuple[float, ...] = ()) -> Method:
-        def build(tare: Tare, value: float | None) -> Image:
-            if (method, value) not in made:
-                made[method, value] = _peers.PyEIT(method, value, N)
-            return _difference(made[method, value], tare.adjacent0)
-
-        return Method(f"{_peers.name()} {label}", build, values, pattern="adjacent")
+        return _linear(f"{_peers.name()} {label}", lambda v: _peers.PyEIT(method, v, N), values, "adjacent")
 
     return [row("JAC", "jac", (1e-3, 0.01, 0.1, 1.0)), row("GREIT", "greit", (1e-3, 0.01, 0.1)), row("BP", "bp")]
 
@@ -130,24 +123,29 @@ def training(network: onnxruntime.InferenceSession) -> str:
     return f"{json.loads(said)['minutes']:g} min" if said else "training time not recorded"
 
 
+def _by_network(name: str, bundle: Bundle, image: Callable[[Operator, np.ndarray], Array]) -> Method:
+    """image: of the difference that the bundle makes, by the operator for its noise."""
+
+    def build(tare: Tare, value: float | None) -> Image:
+        pre = bundle.prereconstructor()
+        operator = pre.condition(tare.sigma)
+        return lambda z: image(operator, pre.difference(z, tare.pairs0))
+
+    return Method(name, build, gain=False)
+
+
 def published(bundle: Bundle) -> list[Method]:
     """The paper's network and its twin without attention, where models/published.py has trained them."""
 
     def row(name: str, path: Path) -> Method:
         network = session(path)
 
-        def build(tare: Tare, value: float | None) -> Image:
-            pre = bundle.prereconstructor()
-            operator = pre.condition(tare.sigma)
+        def image(operator: Operator, difference: np.ndarray) -> Array:
+            step = operator.one_step(difference, N, THRESHOLD_T)
+            found = network.run(None, {"image": step[None, None].astype(np.float32)})[0]
+            return np.asarray(found[0, 0], float)
 
-            def image(z: Array) -> Array:
-                step = operator.one_step(pre.difference(z, tare.pairs0), N, THRESHOLD_T)
-                found = network.run(None, {"image": step[None, None].astype(np.float32)})[0]
-                return np.asarray(found[0, 0], float)
-
-            return image
-
-        return Method(f"{name}, {training(network)}", build, gain=False)
+        return _by_network(f"{name}, {training(network)}", bundle, image)
 
     files = {"MM-CNN as published": "mmcnn.onnx", "the same without attention": "cnn.onnx"}
     return [row(name, PUBLISHED / file) for name, file in files.items() if (PUBLISHED / file).exists()]
@@ -160,15 +158,9 @@ def network_alone(bundle: Bundle) -> list[Method]:
         return []
     network = session(path)
 
-    def build(tare: Tare, value: float | None) -> Image:
-        pre = bundle.prereconstructor()
-        operator = pre.condition(tare.sigma)
+    def image(operator: Operator, difference: np.ndarray) -> Array:
+        stack, context, scale = operator.stack(difference)
+        drop = network.run(["drop"], {"stack": stack[None], "context": context[None]})[0]
+        return np.asarray(drop[0, 0] * scale)
 
-        def image(z: Array) -> Array:
-            stack, context, scale = operator.stack(pre.difference(z, tare.pairs0))
-            drop = network.run(["drop"], {"stack": stack[None], "context": context[None]})[0]
-            return np.asarray(drop[0, 0] * scale)
-
-        return image
-
-    return [Method("eitskin, its network alone", build, gain=False)]
+    return [_by_network("eitskin, its network alone", bundle, image)]

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from bench.accuracy.frames import SKIN, Level
 from bench.accuracy.scores import METRES_PER_UNIT
-from bench.goals import Goal
+from bench.goals import Goal, titled
 from models import metrics
 from models.bundle import Bundle
 from models.mismatch import NAMED, Mismatch, MismatchedSheet, soft_drop
@@ -126,9 +126,8 @@ def goals(found: dict[str, Any]) -> list[Goal]:
 
 def table(found: dict[str, Any]) -> Table:
     title = f"mismatched skins, {found['mesh']} mesh: as the bundle's file says, and mounting fitted"
-    made = Table(title=title, title_justify="left")
-    for heading in ("mismatch", "noise", "mean IoU", "fitted", "force error, %", "fitted", "valid, %", "fitted"):
-        made.add_column(heading, justify="left" if heading in ("mismatch", "noise") else "right")
+    headings = "mismatch", "noise", "mean IoU", "fitted", "force error, %", "fitted", "valid, %", "fitted"
+    made = titled(title, headings, 2)
     for row in found["rows"]:
         both = row["file"], row["calibrated"]
         cells = [form.format(of[key]) for key, form in FIGURES for of in both]

@@ -10,7 +10,7 @@ from rich.table import Table
 from bench.accuracy.compare import SERVICE
 from bench.accuracy.frames import Level
 from bench.accuracy.scores import Row
-from bench.goals import Goal
+from bench.goals import Goal, titled
 from bench.machine import machine
 
 COLUMNS = (  # heading, key, format
@@ -59,10 +59,8 @@ def text(row: Mapping[str, float | None], key: str, form: str) -> str:
 
 
 def table(level: str, rows: Sequence[Row], floor: Row, mesh: str, reads: str) -> Table:
-    made = Table(title=f"{Level(level).title}, {mesh} mesh, {machine()}", title_justify="left")
-    made.add_column("method")
-    for heading, _, _ in COLUMNS:
-        made.add_column(heading, justify="right")
+    headings = "method", *(heading for heading, _, _ in COLUMNS)
+    made = titled(f"{Level(level).title}, {mesh} mesh, {machine()}", headings)
     for row in (r for r in rows if r["level"] == level):
         name = row["method"] + (f" ({row['value']:g})" if row["value"] is not None else "")
         made.add_row(name, *(text(row, key, form) for _, key, form in COLUMNS))

@@ -30,16 +30,15 @@ from rich.table import Table
 
 from bench import REPORTS
 from bench import goals as _goals
-from bench.goals import Goal
-from bench.json_file import drawn, write_json
-from bench.machine import machine, provenance
+from bench.goals import Goal, titled
+from bench.json_file import write_report
+from bench.machine import machine
 from bench.speed import scale
 from bench.speed.recorded import QUIET_S, SCENES, recorded
-from bench.speed.service import BEGIN, Service, end_on_sigterm, running_square
+from bench.speed.service import BEGIN, Service, end_on_sigterm, heard, running_square, subscribed
 from models.bundle import Bundle
 from models.command import real, whole
 from protocol.frames import ContactFrame, Frame, RawFrame, TruthFrame, pack, unpack
-from protocol.transport import Context
 from services.pipeline import build_stages
 from services.runtime.config import ScanMode, Skin, TouchConfig
 from services.runtime.stage import PROCESSES
@@ -76,11 +75,7 @@ def hops(seconds: float, more: int) -> list[dict[str, Any]]:
     rows = []
     for scan in SCANS:
         with running_square(scan) as service:
-            socket = Context.instance().socket(zmq.SUB)
-            socket.setsockopt(zmq.RCVHWM, 100_000)
-            for process, topic in (("publisher", b"contact/palm\0"), ("stub", b"truth/palm\0")):
-                socket.connect(f"ipc://{service.folder}/{process}.ipc")
-                socket.subscribe(topic)
+            socket = subscribed(service.folder, ("publisher", "stub"), b"contact/palm\0", b"truth/palm\0")
             for scene, begin in BEGIN.items():
                 begin(service)
                 heard(socket, SETTLE_S)
@@ -130,15 +125,6 @@ def chain(stamps: dict[str, int], received: int, written: int) -> list[float]:
     return [1e-6 * (b - a) for a, b in zip(times, times[1:], strict=False)]
 
 
-def heard(socket: zmq.Socket[bytes], seconds: float) -> list[tuple[bytes, int]]:
-    """(message, when it came) of so long; nothing is decoded meanwhile."""
-    found, end = [], time.monotonic() + seconds
-    while (left := end - time.monotonic()) > 0:
-        if socket.poll(int(1000 * left) + 1):
-            found.append((socket.recv(), time.monotonic_ns()))
-    return found
-
-
 @contextmanager
 def controllers(n: int, service: Service) -> Iterator[None]:
     """n further controllers, each a process of its own; one of them stopped by SIGSTOP."""
@@ -155,9 +141,8 @@ def controllers(n: int, service: Service) -> Iterator[None]:
 
 
 def hops_table(rows: list[dict[str, Any]]) -> Table:
-    made = Table(title=f"board's last byte to a controller's recv, ms, {machine()}", title_justify="left")
-    for heading in ("scan", "scene", "frames/s", "p50", "p99", *HOPS, "cores"):
-        made.add_column(heading, justify="left" if heading in ("scan", "scene") else "right")
+    headings = "scan", "scene", "frames/s", "p50", "p99", *HOPS, "cores"
+    made = titled(f"board's last byte to a controller's recv, ms, {machine()}", headings, 2)
     for row in rows:
         cells = [row["rate_hz"], row["p50_ms"], row["p99_ms"], *row["hops_p50_ms"].values(), row["cores"]]
         made.add_row(row["scan"], row["scene"], *(f"{value:.2f}" for value in cells))
@@ -203,9 +188,7 @@ def one_process(frames: list[RawFrame], skin: Skin, bundle: Bundle) -> float:
 
 
 def stages_table(found: dict[str, Any]) -> Table:
-    made = Table(title=f"stages with their wire in one process, CPU ms a whole scan, {machine()}", title_justify="left")
-    for heading in ("", *SCENES):
-        made.add_column(heading, justify="right" if heading else "left")
+    made = titled(f"stages with their wire in one process, CPU ms a whole scan, {machine()}", ("", *SCENES))
     for name, row in found["cpu_ms"].items():
         made.add_row(name, *(f"{row[scene]:.2f}" for scene in SCENES))
     return made
@@ -256,11 +239,7 @@ def main(argv: list[str] | None = None) -> int:
         console.print(scale.table(found["scale"]))
     wanted = goals(found)
     console.print(_goals.table(wanted))
-    write_json(
-        args.out / "latency.json", provenance("latency", argv) | {"targets": [g.to_dict() for g in wanted]} | found
-    )
-    drawn(args.out / "latency.json")
-    print(f"wrote {args.out / 'latency.json'}")
+    write_report(args.out / "latency.json", argv, wanted, found)
     return 0
 
 

@@ -28,9 +28,8 @@ from rich.table import Table
 
 from bench import REPORTS
 from bench import goals as _goals
-from bench.goals import Goal
-from bench.json_file import write_json
-from bench.machine import provenance
+from bench.goals import Goal, titled
+from bench.json_file import write_report
 from bench.speed.relay_frames import HOPS, sizes
 from bench.speed.service import end_on_sigterm
 from models.command import whole
@@ -148,9 +147,7 @@ def goals(relaying: dict[str, dict[str, float]]) -> list[Goal]:
 
 
 def table(title: str, rows: dict[str, dict[str, float]], reference: str) -> Table:
-    made = Table(title=title, title_justify="left")
-    for heading in ("", "p50 ms", "p99 ms", "times ours", "lost"):
-        made.add_column(heading, justify="right" if heading else "left")
+    made = titled(title, ("", "p50 ms", "p99 ms", "times ours", "lost"))
     for label, row in rows.items():
         ratio = f"{row['p50_ms'] / rows[reference]['p50_ms']:.2f}"
         made.add_row(label, f"{row['p50_ms']:.3f}", f"{row['p99_ms']:.3f}", ratio, str(row.get("lost", "")))
@@ -174,9 +171,8 @@ def main(argv: list[str] | None = None) -> int:
         print(line)
     wanted = goals(relaying)
     console.print(_goals.table(wanted))
-    report = {**provenance("peers", argv), "targets": [goal.to_dict() for goal in wanted]}
-    write_json(args.out / "peers.json", report | {"relay": relaying, "left_out": missing})
-    print(f"wrote {args.out / 'peers.json'}")
+    found = {"relay": relaying, "left_out": missing}
+    write_report(args.out / "peers.json", argv, wanted, found, picture=False)
     return 0
 
 

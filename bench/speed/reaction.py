@@ -19,7 +19,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -27,22 +26,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zmq
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from bench import REPORTS
 from bench import goals as _goals
-from bench.goals import Goal
-from bench.json_file import drawn, write_json
-from bench.machine import machine, provenance
+from bench.goals import Goal, titled
+from bench.json_file import write_report
+from bench.machine import machine
 from bench.speed.reaction_events import KINDS, Reaction, SeenFrame, TouchEvent, events, react, scene
-from bench.speed.service import Service, end_on_sigterm, running_square
+from bench.speed.service import end_on_sigterm, heard, running_square, subscribed
 from models.command import whole
 from protocol.frames import ContactFrame, unpack
 from protocol.sockets import ControlClient
-from protocol.transport import Context
 from services.runtime.config import ScanMode
 from simulation.host import SimulatedHost
 
@@ -78,32 +75,6 @@ was measured; the rest of it, the line and acquisition; each stage with the hop 
 Found = list[tuple[TouchEvent, Reaction]]
 
 
-class Ear(threading.Thread):
-    """A controller that takes every contact frame as it comes; `heard` holds (monotonic ns, message)."""
-
-    def __init__(self, service: Service) -> None:
-        super().__init__(name="ear", daemon=True)
-        self.heard: list[tuple[int, bytes]] = []
-        self._socket = Context.instance().socket(zmq.SUB)
-        self._socket.setsockopt(zmq.RCVHWM, 100_000)
-        self._socket.connect(f"ipc://{service.folder}/publisher.ipc")
-        self._socket.subscribe(b"contact/palm\0")
-        self._done = threading.Event()
-        self.start()
-
-    def run(self) -> None:
-        while not self._done.is_set():
-            if self._socket.poll(100):
-                message = self._socket.recv()
-                self.heard.append((time.monotonic_ns(), message))
-        self._socket.close(0)
-
-    def end(self) -> list[tuple[int, bytes]]:
-        self._done.set()
-        self.join()
-        return self.heard
-
-
 def live(mode: ScanMode, plan: list[TouchEvent], more: str) -> tuple[Found, int]:
     """What a controller saw of each event, and how often the stub had no pose ready. more: sections of skin.toml."""
     with tempfile.TemporaryDirectory(prefix="eitskin-reaction") as folder:
@@ -112,15 +83,13 @@ def live(mode: ScanMode, plan: list[TouchEvent], more: str) -> tuple[Found, int]
         with running_square(mode, more) as service:
             stub = ControlClient("stub", SOLVE_S)
             late = int(stub.call("status")["late_poses"])
-            ear = Ear(service)
+            socket = subscribed(service.folder, ["publisher"], b"contact/palm\0")
             start_ns = int(stub.call("scene", name=str(script), solved=True)["start_ns"])
-            last_ns = start_ns + round((plan[-1].end + 1.0) * 1e9)
-            while time.monotonic_ns() < last_ns:
-                time.sleep(0.2)
+            messages = heard(socket, start_ns * 1e-9 + plan[-1].end + 1.0 - time.monotonic())
             late = int(stub.call("status")["late_poses"]) - late
-            heard = ear.end()
+            socket.close(0)
     frames: list[SeenFrame] = []
-    for at, message in heard:
+    for message, at in messages:
         frame = unpack(message)
         assert isinstance(frame, ContactFrame)
         frames.append(SeenFrame((at - start_ns) * 1e-9, (frame.stamps["sample"] - start_ns) * 1e-9, frame))
@@ -213,13 +182,11 @@ def goals(table: Sequence[dict[str, Any]], late: dict[str, int]) -> list[Goal]:
 
 
 def tables(of: Sequence[dict[str, Any]]) -> list[Table]:
-    made = Table(title=f"force leaves zero (or is back) to a controller's recv, ms, {machine()}", title_justify="left")
-    headings = ("scan", "touch", "n", "in place", "p50", "p90", "p99", "first near p50", "p99", "release p50", "p99")
-    for heading in (*headings, "off > 3 sigma", "late", "mm at recv, moving", "held mm", "force"):
-        made.add_column(heading, justify="left" if heading in ("scan", "touch") else "right")
-    parts = Table(title="force leaves zero to the first frame near it: medians of the pieces, ms", title_justify="left")
-    for heading in ("scan", "touch", *PIECES):
-        parts.add_column(heading, justify="left" if heading in ("scan", "touch") else "right")
+    headings = ["scan", "touch", "n", "in place", "p50", "p90", "p99", "first near p50", "p99", "release p50", "p99"]
+    headings += ["off > 3 sigma", "late", "mm at recv, moving", "held mm", "force"]
+    made = titled(f"force leaves zero (or is back) to a controller's recv, ms, {machine()}", headings, 2)
+    pieces = "scan", "touch", *PIECES
+    parts = titled("force leaves zero to the first frame near it: medians of the pieces, ms", pieces, 2)
     for row in of:
         times = [row[f"contact_p{q}_ms"] for q in (50, 90, 99)]
         times += [row[f"{what}_p{q}_ms"] for what in ("near", "gone") for q in (50, 99)]
@@ -270,11 +237,8 @@ def main(argv: list[str] | None = None) -> int:
         }
         for mode, each in found.items()
     }
-    report = {**provenance("reaction", argv), "targets": [goal.to_dict() for goal in listed], "rows": result}
-    path = args.out / f"reaction{'_live' if args.live else ''}.json"
-    write_json(path, {**report, "live": args.live, "steps_ms": steps_ms})
-    drawn(path)
-    print(f"wrote {path}")
+    report = {"rows": result, "live": args.live, "steps_ms": steps_ms}
+    write_report(args.out / f"reaction{'_live' if args.live else ''}.json", argv, listed, report)
     return 0
 
 

@@ -15,15 +15,13 @@ from typing import Any
 
 import msgpack
 import numpy as np
-import zmq
 from rich.table import Table
 
-from bench.goals import Goal
+from bench.goals import Goal, titled
 from bench.machine import machine
 from bench.speed.recorded import recorded
-from bench.speed.service import Outside, Service, running
+from bench.speed.service import Service, running, subscribed
 from protocol.frames import RawFrame, pack
-from protocol.transport import Context
 from services.recordings.recording import RecordingWriter
 from services.runtime.config import ScanMode
 from services.runtime.stage import PROCESSES
@@ -50,8 +48,8 @@ def scaled(n: int, scan: ScanMode, touched: float, seconds: float) -> dict[str, 
         config = Path(folder, "skin.toml")
         config.write_text("\n".join(lines))
         with running("--config", str(config), skin="s00") as service:
-            if moving[0]:
-                _wait_for_touch(service)
+            if moving[0]:  # until the quiet beginning of the recordings is over
+                service.until("s00", lambda frame: frame["contacts"], START_S + MARGIN_S)
             return {"scan": scan, "skins": n, "touched": sum(moving) / n, **measured(service, seconds, n / period_s)}
 
 
@@ -63,25 +61,9 @@ def _write(path: Path, skin: str, frames: Sequence[RawFrame], phase_s: float) ->
             writer.write(topic.decode(), body, later["sample"])
 
 
-def _wait_for_touch(service: Service) -> None:
-    """Until the quiet beginning of the recordings is over."""
-    contacts = Outside("contact", "s00", service.folder)
-    end = time.monotonic() + START_S + MARGIN_S
-    while time.monotonic() < end:
-        got = contacts.recv(0.5)
-        if got and got[0]["contacts"]:
-            break
-    contacts.close()
-
-
 def measured(service: Service, seconds: float, played_hz: float) -> dict[str, Any]:
     """What a controller that takes every contact sees, and what the processes say that they left out."""
-    socket = Context.instance().socket(zmq.SUB)
-    socket.setsockopt(zmq.RCVHWM, 100_000)
-    for process in PROCESSES:
-        socket.connect(f"ipc://{service.folder}/{process}.ipc")
-    for topic in (b"contact/", b"status/"):
-        socket.subscribe(topic)
+    socket = subscribed(service.folder, PROCESSES, b"contact/", b"status/")
     latency: list[float] = []
     seen = set[str]()
     first: dict[tuple[str, str], dict[str, Any]] = {}
@@ -134,9 +116,8 @@ def goals(rows: Sequence[dict[str, Any]]) -> list[Goal]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
-    made = Table(title=f"skins from recordings on one set of processes, {machine()}", title_justify="left")
-    for heading in ("scan", "skins", "touched", "contacts", "overtaken %", "p50 ms", "p99 ms", "cores", "memory MB"):
-        made.add_column(heading, justify="left" if heading == "scan" else "right")
+    headings = "scan", "skins", "touched", "contacts", "overtaken %", "p50 ms", "p99 ms", "cores", "memory MB"
+    made = titled(f"skins from recordings on one set of processes, {machine()}", headings)
     for row in rows:
         numbers = [100 * row["overtaken"], row["p50_ms"], row["p99_ms"], row["cores"], row["memory_mb"]]
         cells = f"{row['skins']}", f"{100 * row['touched']:.0f} %", f"{row['frames']}"

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,9 @@ def running(*arguments: str, skin: str = "palm") -> Iterator[Service]:
     process = subprocess.Popen([sys.executable, str(ROOT / "skin"), "up", *arguments], stdout=log, stderr=log)
     try:
         service = Service(folder, process)
-        service.wait_until_valid(skin)
+        if not service.until(skin, lambda frame: frame["valid"], START_S):
+            said = (folder / "log.txt").read_text()[-2000:]
+            raise RuntimeError(f"no valid contact frame within {START_S:.0f} s: {said}")
         yield service
     finally:
         process.send_signal(signal.SIGTERM)
@@ -68,12 +70,11 @@ def running(*arguments: str, skin: str = "palm") -> Iterator[Service]:
 
 
 @contextmanager
-def running_square(scan: ScanMode, more: str = "", bridge: str = "") -> Iterator[Service]:
+def running_square(scan: ScanMode, more: str = "") -> Iterator[Service]:
     """`running` with the stub's square skin as "palm", scanned so. more: further sections of skin.toml."""
     with tempfile.TemporaryDirectory(prefix="eitskin-bench-") as folder:
         config = Path(folder) / "skin.toml"
-        first = f'bridges = ["{bridge}"]\n' if bridge else ""
-        config.write_text(f'{first}{SQUARE}scan = "{scan}"\n{more}')
+        config.write_text(f'{SQUARE}scan = "{scan}"\n{more}')
         with running("--config", str(config)) as service:
             yield service
 
@@ -84,17 +85,14 @@ class Service:
     def __init__(self, folder: Path, process: subprocess.Popen[bytes]) -> None:
         self.folder, self.process = folder, process
 
-    def wait_until_valid(self, skin: str) -> None:
-        contacts = Outside("contact", skin, self.folder)
-        end = time.monotonic() + START_S
-        while time.monotonic() < end and self.process.poll() is None:
+    def until(self, skin: str, fits: Callable[[dict[str, Any]], object], seconds: float) -> bool:
+        """Whether a contact frame of this skin that fits came within so long."""
+        contacts, end, found = Outside("contact", skin, self.folder), time.monotonic() + seconds, False
+        while not found and time.monotonic() < end and self.process.poll() is None:
             got = contacts.recv(0.5)
-            if got and got[0]["valid"]:
-                contacts.close()
-                return
-        raise RuntimeError(
-            f"no valid contact frame within {START_S:.0f} s: {(self.folder / 'log.txt').read_text()[-2000:]}"
-        )
+            found = got is not None and bool(fits(got[0]))
+        contacts.close()
+        return found
 
     def stub(self, command: str, **arguments: Any) -> dict[str, Any]:
         return ControlClient("stub", 5.0).call(command, **arguments)
@@ -131,13 +129,33 @@ class Service:
         return used
 
 
+def subscribed(folder: Path, processes: Iterable[str], *topics: bytes) -> zmq.Socket[bytes]:
+    """To every message of these topics, as a controller that has none of the project's code."""
+    socket = Context.instance().socket(zmq.SUB)
+    socket.setsockopt(zmq.RCVHWM, 100_000)
+    for process in processes:
+        socket.connect(f"ipc://{folder}/{process}.ipc")
+    for topic in topics:
+        socket.subscribe(topic)
+    return socket
+
+
+def heard(socket: zmq.Socket[bytes], seconds: float) -> list[tuple[bytes, int]]:
+    """(message, when it came) of so long; nothing is decoded meanwhile."""
+    found, end = [], time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        if socket.poll(int(1000 * left) + 1):
+            found.append((socket.recv(), time.monotonic_ns()))
+    return found
+
+
 class Outside:
     """A controller that has none of the project's code: the newest message of a topic, and when it came."""
 
-    def __init__(self, topic: str, skin: str, folder: Path, producer: str = "publisher") -> None:
+    def __init__(self, topic: str, skin: str, folder: Path) -> None:
         self.socket = Context.instance().socket(zmq.SUB)
         self.socket.setsockopt(zmq.CONFLATE, 1)
-        self.socket.connect(f"ipc://{folder}/{producer}.ipc")
+        self.socket.connect(f"ipc://{folder}/publisher.ipc")
         self.socket.subscribe(f"{topic}/{skin}\0".encode())
 
     def recv(self, timeout_s: float) -> tuple[dict[str, Any], int] | None:

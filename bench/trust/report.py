@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from bench.goals import Goal
+from bench.goals import Goal, titled
 from firmware_stub.worlds.table import WORLDS
 
 Column = tuple[str, str, str]  # heading, key, format
@@ -86,9 +86,7 @@ def table_of(title: str, columns: Sequence[Column], rows: Iterable[tuple[str, Ma
 
 def show_beside(ours: Mapping[str, Any], other: Mapping[str, Any]) -> None:
     """Every figure over all rows, beside that of the other checkout."""
-    made = Table(title="all rows, beside the other checkout", title_justify="left")
-    for heading in ("", "here", "other"):
-        made.add_column(heading, justify="right" if heading else "left")
+    made = titled("all rows, beside the other checkout", ("", "here", "other"))
     for _, key, form in (*WRONG, *ERRORS):
         made.add_row(key, *("" if row[key] is None else form.format(row[key]) for row in (ours, other)))
     console().print(made)

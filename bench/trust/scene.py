@@ -13,6 +13,7 @@ from firmware_stub.faults import MUXES
 from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import Cue, PiecewiseLinear, Script, TouchPath
 from firmware_stub.world import Touch, World
+from simulation.faults import row_of
 from simulation.scenes import JUMP_S, ramp, step
 
 TARE_S = 5.0  # nothing touches and nothing fails before; then a person tares
@@ -249,19 +250,11 @@ def _another(rng: np.random.Generator, electrode: int) -> dict[str, object]:
     return {"electrodes": [electrode, int((electrode + rng.integers(1, 16)) % 16)]}
 
 
-def _gain(rng: np.random.Generator, electrode: int) -> dict[str, object]:
-    return {"factor": float(1 + rng.choice([-1, 1]) * 0.05 * 50.0 ** -rng.random())}
-
-
-def _gross_gain(rng: np.random.Generator, electrode: int) -> dict[str, object]:
-    return {"gain": float(1 + rng.choice([-1, 1]) * rng.uniform(0.05, 0.2))}
-
-
 CONTACT_NAMES = ("electrode_drift", "electrode_open")
 Arguments = Callable[[np.random.Generator, int], dict[str, object]]
 CUED: dict[str, tuple[str, Arguments]] = {
-    "gain": ("gain", _gain),
-    "stale_rtia": ("gain", _gross_gain),
+    "gain": ("gain", lambda rng, electrode: row_of("gain").draw(rng)),
+    "stale_rtia": ("gain", lambda rng, electrode: row_of("stale_rtia").draw(rng)),
     "mux_stuck": ("multiplexer", _stuck_bit),
     "electrode_open": ("electrode_open", lambda rng, electrode: {"electrode": electrode}),
     "electrodes_shorted": ("electrode_short", _another),
