@@ -16,10 +16,8 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from tests.needs import pytest_terminal_summary  # noqa: F401  (a hook of pytest)
+from tests.needs import ROOT, pytest_terminal_summary  # noqa: F401  (the last is a hook of pytest)
 from tests.waiting import end, until
-
-ROOT = Path(__file__).resolve().parents[1]
 
 # The same examples every time, so that nothing fails by chance; `make search` looks for others.
 SAYS_THE_LOAD = [hypothesis.HealthCheck.too_slow]

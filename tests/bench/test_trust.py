@@ -7,11 +7,9 @@ import pytest
 from bench import ROOT, same
 from bench.trust import plans, runs
 from bench.trust.judge import Judge
-from bench.trust.runs import skin_of
 from bench.trust.scene import Trouble, TrustScene
 from bench.trust.score import TrustScore
 from bench.trust.session import PlayedSession, SessionPlan
-from bench.trust.stages import Today
 from firmware_stub.worlds import table
 from protocol.frames import Contact, ContactFrame
 from simulation.host import loaded
@@ -39,34 +37,13 @@ def contact(x: float, y: float, force: float, number: int = 1, sigma: float = 0.
     return Contact(id=number, position=[x, y, 0.0], force_n=force, **sigmas)
 
 
-def press(begin, end, force, x, y, radius=0.01):
+def press(begin, end, force, x, y):
     """A disc whose force rises and falls within 0.1 s."""
-    return DiscPress(x, y, begin, end, force, 0.1, radius).path()
+    return DiscPress(x, y, begin, end, force, 0.1).path()
 
 
-def scene(seconds, *tracks, contact=(), tares=()):
-    return TrustScene(seconds, script(*tracks, contact=contact), (), tuple((t, "tare") for t in tares))
-
-
-def played(what, scan, seed=3, world="plain", sheet=None):
-    plan, bundle = SessionPlan(world, seed, what.seconds), loaded("square16")
-    return PlayedSession(plan, what, sheet or table.sheet(world, seed), skin_of(scan, "square16"), bundle)
-
-
-def today(session):
-    return Today(session.skin, loaded("square16"))
-
-
-def frames(what, scan, seed=3, world="plain"):
-    """(sample [s], frame) of the service's own stages."""
-    session = played(what, scan, seed, world)
-    for _, frame in session.contacts({"": today(session)}):
-        yield frame.stamps["sample"] * 1e-9, frame
-    session.host.close()
-
-
-def stronger(touch, share):
-    return replace(touch, drop=touch.drop * (1 + share))
+def scene(seconds, *tracks):
+    return TrustScene(seconds, script(*tracks))
 
 
 HELD = scene(12.0, press(7.0, 11.0, 3.0, 0.02, 0.0))
@@ -185,7 +162,8 @@ def test_another_checkout_says_the_same_of_the_same_frames_and_what_is_kept_is_n
 
 def test_the_truth_says_nothing_of_what_a_world_hides() -> None:
     what = scene(12.0, press(7.0, 9.0, 3.0, 0.0, 0.0))
-    session = played(what, "full", world="creep")
+    plan, skin = SessionPlan("creep", 3, what.seconds), runs.skin_of("full", "square16")
+    session = PlayedSession(plan, what, table.sheet("creep", 3), skin, loaded("square16"))
     assert session.host.rig.field.at(9.2).residues
     truth = TruePaths(what.script.tracks, session.sheet)
     assert truth.at(8.0)[0].force_n == pytest.approx(3.0) and truth.at(9.2) == []

@@ -17,9 +17,9 @@ import pytest
 from protocol.control import ControlClient, ControlError, ControlServer
 from protocol.frames import Contact, ContactFrame, ImageFrame, InfoFrame, ShapeFrame
 from protocol.sockets import Publisher
+from tests.needs import ROOT
 from tests.waiting import end, until
 
-ROOT = Path(__file__).resolve().parents[2]
 SQUARE = [[0.01, -0.01], [0.03, -0.01], [0.03, 0.01], [0.01, 0.01]]
 PLACED = {"pose": [0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], "parent_frame_id": "wrist", "frame_id": "palm"}
 

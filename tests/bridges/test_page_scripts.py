@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tests import needs
+from tests.needs import ROOT
 
 pytestmark = pytest.mark.live
 
-ROOT = Path(__file__).resolve().parents[2]
 VECTORS = sorted((ROOT / "protocol" / "vectors" / "frames").glob("*.bin"))
 READ = """
 import { readFileSync } from "node:fs";

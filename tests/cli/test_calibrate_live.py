@@ -22,11 +22,11 @@ from protocol.sockets import AllReader, NewestReader
 from services.calibration.live import LivePresses
 from services.calibration.reference import ReferenceForce
 from tests.conftest import serving
+from tests.needs import ROOT
 from tests.waiting import WAIT_S, end, until
 
 pytestmark = pytest.mark.live
 
-ROOT = Path(__file__).resolve().parents[2]
 STIFFER = 1.4  # this skin's foam needs so much more force than the shipped one
 SCALE = json.dumps({"scale": STIFFER, "offset": -7.0, "noise": 0.02, "delay_s": 0.03, "drop": 0.1, "silent_s": 0.6})
 PUBLISHER = sys.executable, Path(__file__).with_name("reference_publisher.py")

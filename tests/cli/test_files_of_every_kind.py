@@ -17,8 +17,8 @@ import pytest
 import zstandard
 
 from services.cli.app import run as skin
+from tests.needs import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 MAGIC = b"\x89MCAP0\r\n"
 MEGA = 2**20
 COMMANDS = (

@@ -14,11 +14,10 @@ import pytest
 from protocol.frames import ContactFrame
 from protocol.runtime import host_id
 from protocol.sockets import Publisher
+from tests.needs import ROOT
 from tests.waiting import WAIT_S, until
 
 pytestmark = pytest.mark.live
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def ran(*command, **more):

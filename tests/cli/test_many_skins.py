@@ -16,9 +16,8 @@ import pytest
 from protocol.sockets import NewestReader
 from services.runtime.config import ConfigError, load
 from services.runtime.supervision import programs, stub_arguments
+from tests.needs import ROOT
 from tests.waiting import WAIT_S, end, until
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def two_skins() -> str:

@@ -17,7 +17,6 @@ from services.recordings.npz_file import frames_of, load_npz, read_scans
 from services.runtime.config import Skin, load
 from tests import needs
 
-Arrays = dict[str, np.ndarray]
 PLAIN = Similarity(0.4, 1.0, np.zeros(2), False)
 DISC = "hydrogel_disc16.npz"
 

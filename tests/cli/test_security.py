@@ -15,6 +15,7 @@ from protocol import transport
 from protocol.frames import ContactFrame
 from protocol.sockets import NewestReader, Publisher
 from services.runtime.config import ROOT, load
+from tests.protocol.peers import free_port
 from tests.waiting import WAIT_S, end, until
 
 pytestmark = pytest.mark.live
@@ -24,13 +25,6 @@ SKIN = '[skins.palm]\nport = "stub"\nbundle = "square16"\n'
 
 def of_page(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", (ROOT / "docs" / "security.md").read_text(), re.DOTALL)
-
-
-def free_ports() -> tuple[int, int]:
-    with socket.socket() as one, socket.socket() as two:
-        one.bind(("127.0.0.1", 0))
-        two.bind(("127.0.0.1", 0))
-        return one.getsockname()[1], two.getsockname()[1]
 
 
 def made_local(example: str, ports: tuple[int, int]) -> str:
@@ -60,7 +54,7 @@ def hosts(skin, runtime: Path, tmp_path: Path, monkeypatch):
 
 
 def test_the_pages_hosts_exchange_frames(hosts: tuple[Path, Path]) -> None:
-    ports = free_ports()
+    ports = free_port(), free_port()
     for folder, example in zip(hosts, of_page("toml"), strict=True):
         (folder / "skin.toml").write_text(SKIN + made_local(example, ports))
     robot, arm = (load(folder / "skin.toml").transport() for folder in hosts)
@@ -111,7 +105,7 @@ def test_up_refuses_what_a_process_would_die_of(skin, runtime: Path, tmp_path: P
     def at(address: str) -> str:
         return f'[sockets.addresses]\npublisher = "{address}"\n'
 
-    free, taken = free_ports()
+    free, taken = free_port(), free_port()
     remote = at(f"tcp://0.0.0.0:{free}")
     keys = '[security]\nsecret_key = "keys/robot.key_secret"\nclients = "keys/clients"\n'
     command, pipe = [sys.executable, "-c", LISTENS, str(runtime / "inference.ipc")], subprocess.PIPE

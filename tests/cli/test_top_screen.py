@@ -21,9 +21,9 @@ from services.cli.heatmap import LETTERS, draw
 from services.cli.monitor import Monitor
 from services.cli.screen import screen
 from services.cli.truth import pairs
+from tests.needs import ROOT
 from tests.waiting import until
 
-ROOT = Path(__file__).resolve().parents[2]
 COLUMNS, LINES = 80, 24
 NOW = 1000.0  # s
 

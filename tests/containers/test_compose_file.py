@@ -1,14 +1,12 @@
 """What the compose files grant: no network but where it is needed, no rights but where they are needed."""
 
-from pathlib import Path
 from typing import Any
 
 import yaml
 
 from protocol.topics import BRIDGES
 from services.runtime.config import load
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.needs import ROOT
 
 
 def services(name: str) -> Any:

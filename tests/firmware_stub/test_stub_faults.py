@@ -200,7 +200,7 @@ def test_boards_that_hang_freeze_speak_another_language_jump_in_time_or_are_unpl
 def test_a_fault_that_makes_no_sense_is_refused(host):
     for name, args, says in (
         ("gremlins", {}, "no fault 'gremlins': expected one of wrong_chip_id"),
-        ("electrode_open", {"electrode": 16}, "expected 0 to 15"),
+        *(("electrode_open", {"electrode": e}, f"electrode {e!r}, expected 0 to 15") for e in ("left", 16, -1, 3.5)),
         ("electrodes_swapped", {"electrodes": [2, 2]}, "expected different ones"),
         ("missed_interrupt", {"fraction": 2}, "fraction = 2: expected 0 to 1"),
         ("clock_jump", {"by": 1e30}, r"expected -1000000 to 1000000"),  # ended the stub's process

@@ -14,16 +14,14 @@ from firmware_stub.world import Touch, World, steps_between
 from firmware_stub.worlds import table
 from firmware_stub.worlds.disturbances import Disturbances, Flicker, Hum, Telegraph
 from firmware_stub.worlds.foam import ExponentialCreep, PowerCreep
+from simulation.scenes import path_of
 
 CREEPS = [ExponentialCreep(((0.05, 2.0), (0.05, 40.0))), PowerCreep(0.15, 0.2)]
 NOISE = 1e-4  # relative, of 80 dB
 
 
 def track(begin: float, end: float, to: tuple[float, float] | None = None) -> TouchPath:
-    touch = Touch("circle", 0.01, 0.0, 0.008, 0.4)
-    there = replace(touch, x=to[0], y=to[1]) if to else touch
-    poses = (replace(touch, drop=0.0), touch, there, replace(there, drop=0.0))
-    return TouchPath((begin, begin + 0.05, end - 0.05, end), poses)
+    return path_of(Touch("circle", 0.01, 0.0, 0.008, 0.4), begin, end, 0.05, to)
 
 
 def shown(world: str, *tracks: TouchPath) -> Rig:

@@ -1,7 +1,6 @@
 """Bundles and npz files: read whole and unchanged, or refused early with a reason a person can act on."""
 
 import json
-import os
 import struct
 import zipfile
 
@@ -11,7 +10,7 @@ import pytest
 from models import bundle
 from models.bundle import Bundle, BundleError
 from models.bundle_check import Wrong
-from models.files import FileError, read_bytes
+from models.files import FileError
 from models.npz import read_npz
 from models.response_file import arrays_of_tables, tables_of
 from models.skin_limits import BUNDLE_BYTES
@@ -177,12 +176,3 @@ def test_what_is_no_plain_array_is_refused(tmp_path):
     path.write_bytes(content.replace(real, struct.pack("<I", 136)))  # its directory lies: 32 MB are packed there
     with pytest.raises(FileError):
         read_npz(path)
-
-
-def test_only_files_are_read_and_only_so_much(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "sparse").touch()
-    os.truncate(tmp_path / "sparse", 2**40)
-    for name, says in ((".", "a folder"), ("pipe", "a pipe"), ("sparse", "1099511627776 bytes"), ("none", "No such")):
-        with pytest.raises(FileError, match=says):
-            read_bytes(tmp_path / name, 1000)

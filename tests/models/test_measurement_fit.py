@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from firmware_stub.world import pressed
 from models import bundle, geometry, manifest
 from models.forward import ForwardModel
 from models.linearise import linearise
@@ -16,14 +15,13 @@ from models.measurement import touch as touches
 from models.measurement.course import TouchCourse
 from models.measurement.covariance.noise import NoiseModel
 from models.measurement.covariance.whitening import Whitening
-from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
+from models.measurement.fit import FittedScan, TouchFitter
 from models.measurement.responses.disc import DiscResponse
 from models.measurement.responses.response import DiscGrid
 from models.measurement.responses.tables import SkinTables, tables_of
-from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, VX, TouchPrior, X, Y, anywhere, plain
+from models.measurement.touch import ACTION, PLACE, RATE, VX, TouchPrior, X, Y, anywhere, plain
 from models.response_tables import response_tables
 from models.shapes import Shape
-from tests.models.solved import UNIT_M, action_of, change, tables
 
 NOISE, SPAN_S = 1e-4, 0.0437
 TIMES_S = ((np.arange(120) + 0.5) / 120 - 0.5) * SPAN_S
@@ -198,62 +196,6 @@ def test_what_is_said_of_a_touch_that_changed_at_once_is_how_strongly_it_acts_th
         state = TouchFitter(scan, [replace(prior, turns_s=0.0)], 0.0).fit(20).states[0]
         assert state[ACTION] + state[RATE] * sample_s == pytest.approx(acts, rel=0.05)
         assert state[PLACE] == pytest.approx([0.2, -0.1], abs=0.02)
-
-
-def drawn(touch, rng: np.random.Generator) -> np.ndarray:
-    return np.log1p(change(touch)) + NOISE * rng.standard_normal(120)
-
-
-def fitted(y: np.ndarray, *priors: TouchPrior) -> FoundTouches:
-    course, covariance = TouchCourse(DiscResponse(tables()), TIMES_S, SPAN_S), NoiseModel(tables()).covariance(0)
-    return TouchFitter(FittedScan(y, covariance, course, tables().misfit, 120), priors).fit(12)
-
-
-def test_a_fit_finds_place_action_and_size_within_their_sigmas() -> None:
-    rng, off = np.random.default_rng(1), []
-    for _ in range(12):
-        x, y = rng.uniform(-35, 35, 2)
-        touch = pressed("circle", x * 1e-3, y * 1e-3, rng.uniform(6e-3, 15e-3), rng.uniform(0.5, 4))
-        fit = fitted(drawn(touch, rng), anywhere(x / 50 + 0.1, y / 50 - 0.1, action_of(touch), SPAN_S))
-        sd = np.sqrt(np.diag(fit.covariance))
-        assert fit.chi2 < 1.45 and fit.states[0, ACTION] == pytest.approx(action_of(touch), rel=0.08)
-        assert abs(fit.states[0, LOG_RADIUS] - np.log(touch.radius / UNIT_M)) < 4 * sd[LOG_RADIUS] + 0.05
-        off.append((fit.states[0, PLACE] - [x / 50, y / 50]) / sd[PLACE])
-    assert np.abs(off).max() < 4 and 0.2 < np.std(off) < 1.6
-
-
-def test_a_touch_that_is_no_disc_is_explained_by_its_own_directions() -> None:
-    touch = pressed("rectangle", 0.009, -0.006, 0.015, 3.0, rotation=0.4, aspect=2.0)
-    fit = fitted(drawn(touch, np.random.default_rng(2)), anywhere(0.1, -0.1, 0.05, SPAN_S))
-    assert fit.chi2 < 1.45 and np.linalg.norm(fit.states[0, PLACE] * UNIT_M - [0.009, -0.006]) < 1e-3
-
-
-def test_a_ramp_and_a_slide_within_a_scan_are_told_with_their_rates() -> None:
-    instants = np.linspace(0, 1, 7)
-    at = [pressed("circle", (2 + 6 * u) * 1e-3, 5e-3, 9e-3, 1 + 0.6 * u) for u in instants]
-    course, tau = np.array([change(touch) for touch in at]), (np.arange(120) + 0.5) / 120
-    values = np.log1p([np.interp(t, instants, course[:, k]) for k, t in enumerate(tau)])
-    values += NOISE * np.random.default_rng(3).standard_normal(120)
-    prior = anywhere(0.1, 0.1, 0.03, SPAN_S)
-    prior.sd[VX:] = 0.2 / SPAN_S
-    fit = fitted(values, prior)
-    assert fit.chi2 < 1.45
-    assert fit.states[0, PLACE] == pytest.approx([5 / 50, 5 / 50], abs=0.02)
-    assert fit.states[0, VX] * SPAN_S == pytest.approx(6 / 50, rel=0.25)
-    assert fit.states[0, RATE] * SPAN_S / fit.states[0, ACTION] == pytest.approx(0.6 / 1.3, rel=0.35)
-
-
-def test_two_touches_are_told_apart_by_the_grid_and_the_fit() -> None:
-    both = pressed("circle", -15e-3, 5e-3, 8e-3, 2.0), pressed("circle", 15e-3, -5e-3, 8e-3, 0.5)
-    values = np.log1p(change(*both)) + NOISE * np.random.default_rng(4).standard_normal(120)
-    grid, white = DiscGrid(DiscResponse(tables())), Whitening.of(NoiseModel(tables()).covariance(0))
-    z2, disc, _ = grid.likeliest(white.solve(values), grid.information(white))
-    assert z2 > 44 and np.linalg.norm(grid.discs[disc, :2] - [-0.3, 0.1]) < 0.3
-    one = fitted(values, anywhere(-0.3, 0.1, 0.05, SPAN_S))
-    two = fitted(values, anywhere(-0.3, 0.1, 0.05, SPAN_S), anywhere(0.3, -0.1, 0.01, SPAN_S))
-    assert two.evidence > one.evidence + 5 and two.chi2 < 1.45
-    sd = np.sqrt(np.diag(two.covariance))[7:9]
-    assert (np.abs(two.states[1, PLACE] - [0.3, -0.1]) < 3 * sd).all() and (sd < 0.06).all()
 
 
 ELECTRODES = {"width": 5, "count": 12}

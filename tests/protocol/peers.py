@@ -5,11 +5,9 @@ import socket
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
+from tests.needs import ROOT
 from tests.waiting import until
-
-ROOT = Path(__file__).parents[2]
 
 
 def subscribed(publisher, topic="contact", skin="palm", count=1):

@@ -10,23 +10,18 @@ import numpy as np
 from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
 from firmware_stub.worlds import table
-from models.bundle import Bundle
 from models.mismatch import Mismatch
 from models.rolling import order
 from protocol.frames import Contact, ContactFrame, RawFrame
 from services.pipeline import Pipeline
 from services.runtime.config import Skin
 from tests.services import stub_skin
+from tests.services.stub_skin import bundle_of_square16 as bundle
 
 SCAN_S, PARTS, NOISE = 0.0437, 10, 1e-4
 FREE_S = 3.5  # untouched before anything happens: a baseline takes 64 scans
 SKIN = Skin.model_validate({"port": "stub", "bundle": "square16", "frame_id": "palm"})
 Curve = Callable[[np.ndarray], np.ndarray]  # seconds (K,) -> |Z| of each measurement at its own instant
-
-
-@cache
-def bundle() -> Bundle:
-    return Bundle.load("square16")
 
 
 @cache

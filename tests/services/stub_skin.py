@@ -5,7 +5,6 @@ from copy import deepcopy
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_stub.analog import Analog, BoardNoise
 from firmware_stub.faults import Faults
@@ -14,9 +13,8 @@ from models.bundle import Bundle
 from protocol.frames import ELECTRODE_STATES, RawFrame
 from protocol.scan_setting import COHERENT
 from services.pipeline import Pipeline, Result
+from simulation.truth import lasting
 
-TRANSFER = NDArray[np.float64]
-Contacts = tuple[tuple[int, float], ...]  # electrodes, and the factors on their contact impedances
 SCAN_S = 0.045
 METRES = 0.05  # per unit of the bundle's model
 TARE_SCANS = 72
@@ -42,7 +40,7 @@ def sheet():
 
 @cache
 def transfer(shapes=(), contacts=()):
-    """(16, 16) ohm of the stub's sheet, touched."""
+    """(16, 16) ohm of the stub's sheet, touched. contacts: electrodes, and the factors on their contact impedances."""
     impedance = sheet().skin.contact_impedance.copy()
     for electrode, factor in contacts:
         impedance[electrode] *= factor
@@ -52,11 +50,13 @@ def transfer(shapes=(), contacts=()):
 class StubSkin:
     """The stub's analogue part, then the stages of square16; a tared one takes over the state of another."""
 
-    def __init__(self, snr_db=80.0, tare=True, skin="square16"):
-        self.pattern, self.faults, self.scan = np.asarray(bundle_of_square16().pattern), Faults(), 0
+    def __init__(self, snr_db=80.0, tare=True, skin="square16", bundle=None):
+        """bundle: that the skin names, where it is not square16."""
+        bundle = bundle or bundle_of_square16()
+        self.pattern, self.faults, self.scan = np.asarray(bundle.pattern), Faults(), 0
         copied = tare and skin == "square16"
         self.analog = Analog(BoardNoise(10 ** (-snr_db / 20)), self.faults, np.random.default_rng(4 if copied else 3))
-        self.pipeline = Pipeline(skin, name="palm", bundle=bundle_of_square16())
+        self.pipeline = Pipeline(skin, name="palm", bundle=bundle)
         if copied:
             for stage, state in zip(self.stages, deepcopy(_tared(snr_db)), strict=True):
                 stage.load(state)
@@ -102,10 +102,6 @@ def _tared(snr_db):
     skin = StubSkin(snr_db, tare=False)
     assert not skin.rest(TARE_SCANS).delta.touched
     return [stage.state() for stage in skin.stages]
-
-
-def lasting(frame):
-    return [contact for contact in frame.contacts if contact.state != "end"]
 
 
 def present(result):

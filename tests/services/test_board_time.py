@@ -2,14 +2,12 @@
 
 import threading
 from collections import deque
-from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from firmware_stub.rig import Rig
-from firmware_stub.sheet import Sheet
 from firmware_stub.timeline import Script, Timeline
 from models.bundle import Bundle
 from protocol import link
@@ -24,16 +22,12 @@ from services.board.scan_order import ScanOrder
 from services.board.source import BoardSource
 from services.board.time_questions import TimeQuestions
 from services.runtime.config import Skin
+from tests.services.stub_skin import sheet
 from tests.waiting import WAIT_S
 
 MS = 1_000_000
 BEGAN = 10**12  # host ns at which the board's clock shows 0
 LEAST_STEP_S = 2e-4
-
-
-@cache
-def sheet():
-    return Sheet("square16")
 
 
 def heard(clock, until_s, late_s, from_s=0.0):

@@ -115,21 +115,13 @@ def test_a_touch_held_for_ten_minutes_does_not_fade(time):
     assert not any(out.touched for out in time.frames(solved(), 5.0)[8:])
 
 
-def test_creep_after_a_release_is_followed(time):
-    """Foam that keeps 4 % of 4 N, and recovers."""
-    free, pressed = solved(), solved(Touch("circle", 0.01, 0.01, 0.015, 0.4))
+@pytest.mark.parametrize(("radius", "drop", "left", "fades_s"), [(0.010, 0.6, 0.03, 5), (0.015, 0.4, 0.04, 20)])
+def test_a_light_press_where_a_strong_one_was_is_no_creep(time, radius, drop, left, fades_s):
+    """What a strong touch leaves in the foam is no touch and fades: what comes back is a touch."""
+    free, pressed = solved(), solved(Touch("circle", 0.01, 0.01, radius, drop))
     time.frames(pressed, 10.0)
-    outs = time.frames(lambda t: free + 0.04 * np.exp(-t / 20) * (pressed - free), 40.0)
-    assert not any(out.touched for out in outs[5:])
-    assert all(out.touched for out in time.frames(free + 0.3 * (pressed - free), 1.0))  # a touch at the same place
-
-
-def test_a_light_press_where_a_strong_one_was_is_no_creep(time):
-    """What a strong touch leaves behind fades: what comes back is a touch."""
-    free, pressed = solved(), solved(Touch("circle", 0.01, 0.01, 0.010, 0.6))
-    time.frames(pressed, 10.0)
-    outs = time.frames(lambda t: free + 0.03 * np.exp(-t / 5) * (pressed - free), 20.0)
-    assert not any(out.estimates for out in outs[3:])
+    outs = time.frames(lambda t: free + left * np.exp(-t / fades_s) * (pressed - free), 15.0 + 1.25 * fades_s)
+    assert not any(out.estimates for out in outs[3:]) and not any(out.touched for out in outs[5:])
     again = time.frames(free + 0.1 * (pressed - free), 2.0)
     assert all(out.touched and out.estimates for out in again[2:])
     assert not any(out.touched for out in time.frames(free, 3.0)[4:])
@@ -156,10 +148,12 @@ def of(shape):
     return Touch(shape.kind, METRES * shape.x, METRES * shape.y, METRES * shape.radius, shape.drop)
 
 
-@pytest.mark.parametrize(("background", "changed"), [(0.97, 0), (1.03, 0), (1.0, 3)])
+@pytest.mark.parametrize(("background", "changed"), [(0.97, 0), (1.03, 0), (1.0, 3), (0.98, 16)])
 def test_rows_of_a_skin_that_drifted_since_its_untouched_ones(skin, bundle, background, changed):
+    """`skin reconstruct` knows no times: three contacts of +10 %, or all of up to +-30 %, are drift, and so is 3 %."""
     rng, factor = np.random.default_rng(1), np.ones(16)
     factor[rng.permutation(16)[:changed]] = 1.1
+    factor = factor if changed < 16 else 1 + 0.2 * rng.standard_normal(16).clip(-1.5, 1.5)
     worn = {"background": background, "contact": factor}
     rows = np.array([solved(**worn), *(solved(of(touch), **worn) for touch in TOUCHES)])
     untouched = solved() * (1 + 1e-4 * rng.standard_normal((64, rows.shape[1])))
@@ -188,20 +182,6 @@ def test_touches_that_press_in_one_row_are_counted(bundle, skin):
     measured = np.array(rows) * (1 + 1e-4 * rng.standard_normal((len(rows), len(rows[0]))))
     out = reconstruct(Input(measured, untouched, None), skin, bundle)
     assert out["valid"].all() and np.sum(out["count"] == counts) >= 11
-
-
-def test_rows_that_only_drifted_are_untouched(bundle, skin):
-    """`skin reconstruct` knows no times: contacts +-30 % and a sheet of 2 % less are drift, with a touch or without."""
-    rng = np.random.default_rng(4)
-    worn = {"background": 0.98, "contact": 1 + 0.2 * rng.standard_normal(16).clip(-1.5, 1.5)}
-    touch = Touch("circle", 0.01, -0.02, 0.010, 0.2)
-    rows = np.array([solved(**worn), solved(), solved(touch), solved(touch, **worn)])
-    untouched = solved() * (1 + 1e-4 * rng.standard_normal((64, rows.shape[1])))
-    found = reconstruct(Input(rows * (1 + 1e-4 * rng.standard_normal(rows.shape)), untouched, None), skin, bundle)
-    assert found["touched"].tolist() == [False, False, True, True]
-    assert found["count"].tolist()[:3] == [0, 0, 1]
-    fresh = reconstruct(Input(rows[:1], untouched, None), skin, bundle, age_s=0.0)
-    assert fresh["touched"].tolist() == [True]  # who says that no time has passed is believed
 
 
 def test_a_service_that_comes_back_after_fifty_minutes_under_a_touch():

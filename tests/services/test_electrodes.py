@@ -245,9 +245,6 @@ def test_a_second_disc_that_may_be_none_is_not_shown(skin: StubSkin) -> None:
     assert all(r.contact.valid and len(present(r)) == 1 for r in felt)
 
 
-HELD = (Shape("circle", 0.3, -0.2, 0.2, 0.3),)
-
-
 def sliding(step: int) -> tuple[Shape, ...]:
     """About 0.3 mm from frame to frame."""
     return (Shape("circle", 0.1 + 0.0055 * step, -0.26, 0.28, 0.45),)
@@ -264,7 +261,7 @@ def named(results: list[Result]) -> list[int]:
 @pytest.mark.parametrize("held", [False, True])
 @pytest.mark.parametrize("gain", [-0.1, -0.001, 0.006])
 def test_a_step_is_named_at_once_and_moves_no_touch(skin: StubSkin, gain: float, held: bool) -> None:
-    touch, twin = HELD if held else (), StubSkin()  # the twin's gain stays
+    touch, twin = PRESS if held else (), StubSkin()  # the twin's gain stays
     before, same = skin.felt(8, touch), twin.felt(28, touch)[-1]
     assert not named(before)
     with skin.fault("gain", factor=1 + gain):

@@ -23,9 +23,11 @@ def test_an_untouched_skin_that_warms_stays_untouched(parts):
 
 
 @BOTH
-@pytest.mark.parametrize(("radius", "force"), [(5e-3, 0.5), (20e-3, 6.0)])
-def test_a_press_is_shown_where_it_is_and_as_strong_as_it_is(parts, radius, force):
-    touch = pressed("circle", 0.012, -0.018, radius, force)
+@pytest.mark.parametrize(
+    ("kind", "radius", "force"), [("circle", 5e-3, 0.5), ("circle", 20e-3, 6.0), ("rectangle", 15e-3, 3.0)]
+)
+def test_a_press_is_shown_where_it_is_and_as_strong_as_it_is(parts, kind, radius, force):
+    touch = pressed(kind, 0.012, -0.018, radius, force, rotation=0.4, aspect=2.0 if kind == "rectangle" else 1.0)
     shown = between_s(run(press(touch), FREE_S + 1.2, parts), FREE_S + 0.3)
     assert shows(shown, 1) and len(ids(shown)) == 1
     away = list[float]()

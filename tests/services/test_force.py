@@ -8,7 +8,7 @@ import pytest
 from models import geometry
 from models.bundle import Bundle
 from models.forward import shared
-from models.pressure import FOAM
+from models.pressure import FOAM, disc
 from models.shapes import Shape
 from models.solved_presses import SolvedPresses, solve
 from protocol.frames import Contact
@@ -19,10 +19,6 @@ from services.estimation.initialisation.baseline import take
 from services.pipeline import Pipeline
 from services.runtime.config import ConfigError, Skin
 from tests.services.stub_skin import METRES, present, whole_scan
-
-
-def disc_area(radius_m: float) -> float:
-    return float(np.pi * radius_m**2)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +103,7 @@ def test_the_force_of_a_press_is_told_whatever_its_size(bundle: Bundle) -> None:
     skinny = Skinny(configured(), bundle, mesh.z0, 80.0)
     for mm, newton in ((mm, newton) for mm in (6.0, 8.5, 12.0, 18.0) for newton in (1.0, 2.0, 4.0) for _ in range(2)):
         radius = mm * 1e-3
-        drop = FOAM.flat_drop(newton, disc_area(radius))
+        drop = FOAM.flat_drop(newton, disc(radius))
         x, y = rng.uniform(-1 + radius / METRES, 1 - radius / METRES, 2)
         c = skinny.press(mesh.change(Shape("circle", x, y, radius / METRES, drop)), 6)
         assert c is not None and c.force_n is not None and c.force_sigma_n is not None
@@ -142,7 +138,7 @@ def with_law(bundle: Bundle, **said: object) -> Bundle:
 
 @pytest.mark.parametrize(("radius", "drop"), [(0.01, 0.3), (0.005, 0.7), (0.02, 0.1)])
 def test_an_image_tells_the_foams_pressure_and_its_patch(radius: float, drop: float) -> None:
-    area, gain = disc_area(radius), 0.03 * float(FOAM.gain(drop))
+    area, gain = disc(radius), 0.03 * float(FOAM.gain(drop))
     force = of_images().force(look(peak=drop, peak_sigma=0.03 * drop, integral=area * drop))
     assert force.newton == pytest.approx(FOAM.force("circle", drop, area))
     assert force.pressure == pytest.approx(float(FOAM.pressure(drop)))
@@ -158,7 +154,7 @@ def test_a_force_of_saturated_foam_says_so() -> None:
 
 
 def test_of_a_known_indenter_an_image_tells_only_how_strongly_it_acts() -> None:
-    area, law = disc_area(0.005), of_images(indenter={"radius_m": 0.005})
+    area, law = disc(0.005), of_images(indenter={"radius_m": 0.005})
     drop = FOAM.flat_drop(2.0, area)
     force = law.force(look(peak=drop, peak_sigma=0.03, integral=area * drop))
     assert (force.newton, force.pressure) == pytest.approx((2.0, 2.0 / area), rel=0.01)
@@ -203,4 +199,4 @@ def test_an_indenter_that_cannot_press_this_skin_is_refused(bundle: Bundle) -> N
             ForceLaw.of(configured(indenter={"radius_m": radius}), bundle, "palm")
     for radius in (0.001, 0.05):
         law = ForceLaw.of(configured(indenter={"radius_m": radius}), bundle)
-        assert law.indenter_m2 == pytest.approx(disc_area(radius))
+        assert law.indenter_m2 == pytest.approx(disc(radius))

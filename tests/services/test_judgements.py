@@ -190,8 +190,8 @@ def test_a_published_reference_is_explained(bundle, reference):
 PERIOD_US = 43_700
 
 
-def whole(number, z=2.0):
-    values, status = np.full(120, z, np.complex64), np.zeros(120, np.uint8)
+def whole(number):
+    values, status = np.full(120, 2.0, np.complex64), np.zeros(120, np.uint8)
     frame = RawFrame(skin="palm", scan=number, device_us=number * PERIOD_US, z=values, status=status)
     frame.valid, frame.stamps = True, {"sample": number * PERIOD_US * 1000 + PERIOD_US * 500}
     return frame

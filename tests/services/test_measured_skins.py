@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from firmware_stub.analog import Analog, BoardNoise
-from firmware_stub.faults import Faults
 from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
 from models import bundle, geometry, manifest
@@ -12,7 +10,6 @@ from models.bundle import Bundle
 from models.forward import ForwardModel
 from models.linearise import linearise
 from models.shapes import Shape
-from protocol.scan_setting import COHERENT
 from services.calibration.fields import half_width, sample, sensitivities
 from services.calibration.register_command import register_presses
 from services.contacts.placing import placement
@@ -155,43 +152,30 @@ PRESSES = {  # m, in the skin's frame, and how far off a contact may be: 3 % of 
 }
 
 
-class Made:
-    """A skin's bundle, and its stub: board and sheet on another mesh."""
-
-    def __init__(self, name, folder):
-        data = {"name": name, "unit": "mm", "contact_impedance": 0.01, **SKINS[name]}
-        skin = geometry.from_dict(data)
-        matrices = linearise(ForwardModel(skin), "model")
-        bundle.write(folder / name, manifest.describe(name, skin, matrices), matrices)
-        self.sheet = Sheet(str(folder / name))
-        self.analog = Analog(BoardNoise(1e-4), Faults(), np.random.default_rng(1))
-        config = Skin(port="stub", bundle=str(folder / name), frame_id=name, network="none")
-        self.pipeline, self.scan = Pipeline(config, name=name), 0
-
-    def feel(self, world, scans):
-        t = self.sheet.transfer(world)
-        for _ in range(scans):
-            self.scan += 1
-            z, status = self.analog.measure((t, t), self.sheet.skin.pattern, COHERENT, 40_000.0, 0.0)
-            result = self.pipeline.run(whole_scan(z, self.scan, status))
-        return result
-
-
 @pytest.mark.parametrize("name", ["disc12", pytest.param("ell16", marks=pytest.mark.release)])
 def test_presses_are_found_where_they_are(name, tmp_path):
-    made = Made(name, tmp_path)
-    rest = made.feel(World(), 80)
+    """The skin's bundle, and its stub: board and sheet on another mesh."""
+    skin = geometry.from_dict({"name": name, "unit": "mm", "contact_impedance": 0.01, **SKINS[name]})
+    matrices = linearise(ForwardModel(skin), "model")
+    made = bundle.write(tmp_path / name, manifest.describe(name, skin, matrices), matrices)
+    config, sheet = Skin(port="stub", bundle=str(made.path), frame_id=name, network="none"), Sheet(str(made.path))
+    stub = StubSkin(tare=False, skin=config, bundle=made)
+
+    def feel(world, scans):
+        return [stub.see(sheet.transfer(world)) for _ in range(scans)][-1]
+
+    rest = feel(World(), 80)
     if rest.contact.reasons == ["stale_baseline"]:  # the L's mesh and the stub's differ too much to be sure: one tare
-        made.pipeline.pre.command("tare", {})
-        rest = made.feel(World(), 8)
+        stub.pipeline.pre.command("tare", {})
+        rest = feel(World(), 8)
     assert rest.contact.valid and not rest.contact.contacts, rest.contact.reasons
     places, most = PRESSES[name]
     for x, y in places:
-        contact = made.feel(World(touches=(Touch("circle", x, y, 0.006, 0.3),)), 8).contact
+        contact = feel(World(touches=(Touch("circle", x, y, 0.006, 0.3),)), 8).contact
         assert contact.valid and len(contact.contacts) == 1, (x, y, contact.reasons)
         found = contact.contacts[0].position
         assert np.hypot(found[0] - x, found[1] - y) < most, (x, y, found)
-        assert not made.feel(World(), 12).contact.contacts
+        assert not feel(World(), 12).contact.contacts
 
 
 RADIUS = 0.04  # m: a forearm

@@ -316,10 +316,7 @@ def test_scans_that_are_the_same_or_too_noisy_are_doubted(skin, bundle, snr_db, 
 @pytest.mark.parametrize("reason", ["frozen", "clock"])
 def test_frames_that_acquisition_does_not_believe_are_no_baseline(fed: Fed, board: Board, reason: str) -> None:
     for _ in range(80):
-        frame = board.frame()
-        frame.valid, frame.reasons = False, [reason]
-        received = unpack(pack(frame))
-        assert isinstance(received, RawFrame) and "stale_baseline" in fed.run(received).reasons
+        assert "stale_baseline" in fed.run(not_believed(board.frame(), reason)).reasons
     assert fed.stage.saved() is None and "0 of 64 frames" in refusal(fed)
 
 

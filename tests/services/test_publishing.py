@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from models.pressure import FOAM
+from models.pressure import disc as area
 from protocol import frames as wire
 from protocol.frames import ContactFrame, EstimatedTouch, ForceFrame, ImageFrame, PartFrame, ShapeFrame
 from services.contacts.images.outline import outline
@@ -81,10 +82,6 @@ def contacts(stage, frame):
 def only(stage, frame):
     (contact,) = contacts(stage, frame).contacts
     return contact
-
-
-def area(radius):
-    return math.pi * radius**2
 
 
 def test_position_force_area_and_wrench_of_a_touch(stage, of_peak):

@@ -18,8 +18,6 @@ from services.runtime.config import Skin
 from tests.services.conftest import Board
 from tests.services.stub_skin import lasting
 
-Arrays = dict[str, np.ndarray]
-
 
 @pytest.fixture(scope="module")
 def presses(reference):

@@ -16,8 +16,6 @@ from tests.services.stub_skin import METRES, SCAN_S, StubSkin, lasting, present,
 GATE_M = 0.015  # further away a contact is not the touch's
 LOST = 0.02  # share of frames that do not arrive
 
-Scene = list[list[Shape]]  # frame by frame, each touch at its place in the list
-
 
 def touches(rng):
     radius, drop = rng.uniform(0.14, 0.22, 2), rng.uniform(0.2, 0.45, 2)
