@@ -238,7 +238,7 @@ class Preprocessing(Stage):
     def _refer(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
         """A scan that is untouched, as the file says: the baseline until the next one."""
         amplitude = np.where(frame.status == 0, np.abs(frame.z.astype(np.complex128)), np.nan)
-        found = self.references.baseline(amplitude, frame.scan, frame.board, self._sample_ns)
+        found = self.references.baseline(amplitude, frame.scan, frame.board, self._sample_ns, self.pre)
         if found is None:
             self._forget_baseline()
             self._problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"

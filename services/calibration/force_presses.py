@@ -114,7 +114,7 @@ def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None])
         bundle = mounted_bundle(data.untouched, bundle, warn)
     name = skin.frame_id or "skin"
     pipeline = Pipeline(skin, name, bundle, always_reconstruct=True, each_alone=True)
-    baseline = baseline_of(data.untouched, pipeline.pre.pre, warn)
+    baseline = baseline_of(data.untouched, pipeline.pre.pre, warn, data.measurements)
     read = TouchReader(skin, bundle, each_alone=True)
 
     def seen(row: int) -> SeenTouch:

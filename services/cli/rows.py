@@ -31,7 +31,8 @@ UntouchedOption = Annotated[
 ]
 
 DO = {
-    "stale_baseline": "give 16 or more rows of `untouched` of just before, with nothing on the skin",
+    "stale_baseline": "give 16 or more rows of `untouched` of just before, with nothing on the skin, of the skin and "
+    "the order of columns (--skin, --pattern) that are said",
     "touched_at_start": "something stood on the skin in `untouched`: give rows without it",
     "out_of_distribution": "see that --skin and the order of columns (--pattern) are those measured, and that "
     "`untouched` is of just before",

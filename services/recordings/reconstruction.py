@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,15 @@ from models.bundle import Bundle, BundleError
 from models.calibration_file import found_by
 from models.prereconstruction import PreReconstructor, noise_of_frames
 from protocol.frames import RawFrame
-from services.estimation.initialisation.baseline import Baseline, NoBaseline, take
+from services.estimation.initialisation.baseline import (
+    SEE,
+    UNLIKE,
+    Baseline,
+    NoBaseline,
+    coarseness,
+    implausible,
+    take,
+)
 from services.estimation.values import numbers
 from services.estimation.values.judgement import Judgement, Verdict
 from services.mounting import MountingFit, needs_fit
@@ -71,15 +80,32 @@ def mounted_bundle(frames: Array, bundle: Bundle, warn: Callable[[str], None]) -
     return found.bundle
 
 
-def baseline_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None]) -> Baseline:
-    """The tare of (M, K) untouched |Z|; where a board's tare would refuse, the mean all the same, in doubt."""
+def baseline_of(
+    frames: Array, pre: PreReconstructor, warn: Callable[[str], None], rows: NDArray[Any] | None = None
+) -> Baseline:
+    """The tare of (M, K) untouched |Z|; where a board's tare would refuse, the mean all the same, in doubt.
+
+    rows: (N, K) of the same file, which say in which steps it was measured.
+    """
+    found = _mean_of(frames, pre, warn)
+    if off := implausible(found.z0, found.sigma / found.frames**0.5, pre, UNLIKE):
+        doubt = f"`untouched` is {off}: {SEE} (--skin, --pattern)"
+    elif steps := coarseness(frames if rows is None else rows):
+        doubt = f"|Z| is known {steps}: measure it with 10 bits or more"
+    else:
+        return found
+    warn(doubt)
+    return replace(found, doubt=doubt)
+
+
+def _mean_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None]) -> Baseline:
     doubt = ""
     if len(frames) > 1 and (frames == frames[0]).all():
         warn("the rows of `untouched` are all equal: only the first is used")  # computed, not measured
         frames = frames[:1]
     if len(frames) >= FEWEST_FOR_TARE:
         try:
-            return take(frames, pre, "file", 0)
+            return take(frames, pre, "file", 0, np.inf)
         except NoBaseline as why:
             doubt = f"`untouched`: {why}"
             warn(doubt + "; using their mean")
@@ -140,7 +166,7 @@ def _reconstruct(
     if data.untouched is None:
         _beside_references(data, pipeline, sequence, rows, out, warn)
         return _with_assumed(out, data, _noise_of_references(data, pipeline), AGE_OF_REFERENCE, "")
-    baseline = baseline_of(data.untouched, pipeline.pre.pre, warn)
+    baseline = baseline_of(data.untouched, pipeline.pre.pre, warn, data.measurements)
     age = f"{age_s:g} s, as told" if age_s is not None else f"not said: up to {UNKNOWN_AGE_S:g} s of drift allowed for"
     for row in rows:
         if not sequence:
@@ -198,7 +224,7 @@ def _beside_references(
     warn: Callable[[str], None],
 ) -> None:
     """Each row against the reference just before it: the very frames that an import or a port gives of such a file."""
-    frames, lost = frames_of(data), 0
+    frames, lost, doubt = frames_of(data), 0, ""
     for row in rows:
         for values, kind in frames:
             frame = raw_frame(values, row, kind, separate=not sequence)
@@ -208,6 +234,9 @@ def _beside_references(
         frame.scan += 1
         _store(out, row, pipeline.run(frame))
         lost += pipeline.pre.baseline is None
+        doubt = doubt or getattr(pipeline.pre.baseline, "doubt", "")
+    if doubt:
+        warn(f"{doubt} (--skin, --pattern)")
     if lost:
         warn(f"{lost} of {len(out['valid'])} rows are not valid: their `reference` gives too few measurements")
 

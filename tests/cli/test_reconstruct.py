@@ -137,12 +137,37 @@ def test_untouched_rows_that_are_computed_or_few(noisy) -> None:
     assert len(said) == 1 and "one row" in said[0]
 
 
+GAINS = np.exp(0.08 * np.random.default_rng(7).standard_normal(120))
+
+
+@pytest.mark.parametrize(("of", "says"), [
+    (lambda z: z * GAINS, ""),  # from one pair of electrodes to the next, as converters have them
+    (lambda z: 1 / z, "off what the bundle predicts"),
+    (lambda z: 20 * np.log10(z), "off what the bundle predicts"),
+    (lambda z: z[..., ::-1], "off what the bundle predicts"),
+    (lambda z: z[..., np.random.default_rng(4).permutation(120)], "off what the bundle predicts"),
+    (lambda z: np.round(z * 255 / z.max()), "in steps of 1, 0.5 % of it"),
+    (lambda z: np.round(z * 511 / z.max()), "in steps of 1, 0.2 % of it"),
+    (lambda z: np.round(z * 4095 / z.max()), ""),
+])  # fmt: skip
+def test_rows_of_another_quantity_order_or_too_coarse_are_not_valid(noisy, of, says: str) -> None:
+    rows = of(np.vstack([noisy["untouched"][:4], noisy["measurements"][:4]]))
+    beside = [Input(rows[4:], rows[:4], None)]
+    if "steps" not in says:
+        beside.append(Input(rows[4:], None, rows[:4]))
+    for data in beside:
+        lines: list[str] = []
+        out = reconstructed(data, warn=lines.append)
+        assert out["valid"].all() if not says else not out["valid"].any() and says in lines[-1], lines
+
+
 def test_what_is_no_impedance_in_untouched_rows_is_no_baseline():
-    rows = np.random.default_rng(0).uniform(1.0, 1.001, (3, 120))
+    bundle = Bundle.load("square16")
+    rows = bundle.z0 * np.random.default_rng(0).uniform(1.0, 1.001, (3, 120))
     rows[:, 0], rows[:, 1], rows[:, 2] = 0.0, -1.0, np.nan
-    baseline = baseline_of(rows, None, print)
-    assert not baseline.z0[:3].any() and np.isinf(baseline.sigma[:3]).all()
-    assert (baseline.z0[3:] > 0.9).all() and (baseline.sigma[3:] < 1e-3).all()
+    baseline = baseline_of(rows, bundle.prereconstructor(), print)
+    assert not baseline.z0[:3].any() and np.isinf(baseline.sigma[:3]).all() and not baseline.doubt
+    assert (baseline.z0 > 0.9 * bundle.z0)[3:].all() and (baseline.sigma < 1e-3 * bundle.z0)[3:].all()
 
 
 N, M = 5, 3

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from models.prereconstruction import PreReconstructor, noise_of_frames
 from protocol.errors import EitskinError
@@ -21,6 +22,11 @@ Array = NDArray[np.float64]
 TAKING = "taking the baseline"  # what the status says until there is one
 OUT_OF_PROPORTION = 1e3  # of a measurement over the median one: pairs of one sheet differ by 10
 IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
+UNLIKE = 0.12  # the same of rows of a file: columns in another order, another unit or pattern misfit by 0.17 and more;
+# with gains of 10 % from pair to pair, electrodes off by 5 mm and a sheet uneven by 20 % touches are still placed right
+SEE = "see that the skin, the order of columns and the unit are those measured"
+REPEATED = 0.1  # of the values that equal the row before: noise of a third of a step gives 0.65, of 4 steps 0.07
+COARSE = 2e-3  # relative step of |Z|: by 9 bits touches of 1 N are placed 4 to 15 mm off, by 10 bits 2 at most
 LEAST_NOISE = 2e-6  # relative: about half a step of the board's 18 bits
 
 
@@ -76,7 +82,7 @@ class Baseline:
         return cls(z0, sigma, *rest, *provenance, noise_frames)
 
 
-def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Baseline:
+def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int, most_misfit: float = IMPLAUSIBLE) -> Baseline:
     """The baseline of (N, K) |Z|. Raises NoBaseline where the frames do not agree with each other.
 
     A measurement that is not finite in every frame gets an infinite sigma: it is left out until the next tare.
@@ -94,9 +100,8 @@ def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int) -> Bas
     share = float(np.median(sigma[live] / z0[live]))
     if pre.m.normalisation == "model" and share > numbers.TARE_UNTRAINED:  # a measured bundle knows its own noise
         doubt = untrained(share)
-    misfit = implausibility(z0, pre)
-    if misfit > IMPLAUSIBLE:
-        doubt = f"the baseline is {100 * misfit:.1f} % off what the bundle predicts: free the skin and run `skin tare`"
+    if off := implausible(z0, sigma / len(frames) ** 0.5, pre, most_misfit):
+        doubt = f"the baseline is {off}: free the skin and run `skin tare`"
     return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
 
 
@@ -146,6 +151,19 @@ def plausible_noise(z0: Array, sigma: Array) -> Array:
     return np.where(np.isposinf(sigma) | ~(np.abs(z0) > 0), np.inf, finite)
 
 
+def coarseness(rows: Array) -> str:
+    """In which steps |Z| of (N, K) rows stands, to a person, where touches are misplaced by them; "" where they are
+    finer, or finer than the noise: a value that the next row has again is rare then.
+    """
+    steps = np.abs(np.diff(np.abs(rows), axis=0))
+    steps = steps[np.isfinite(steps)]
+    if not (steps > 0).any() or (steps == 0).mean() < REPEATED:
+        return ""
+    step = float(steps[steps > 0].min())
+    share = step / float(np.nanmedian(np.abs(rows)))
+    return f"in steps of {step:.3g}, {100 * share:.1g} % of it" if share > COARSE else ""
+
+
 class Agreement(NamedTuple):
     """Whether untouched scans are the same but for their noise."""
 
@@ -183,16 +201,25 @@ def agreement(scans: Array) -> Agreement:
     return Agreement(statistic, float(chi_square * estimated))
 
 
-def implausibility(z0: Array, pre: PreReconstructor) -> float:
-    """rms relative misfit of |Z0| to the bundle's prediction, up to gain and contact impedances; 0 where the bundle
-    predicts none.
+def implausible(z0: Array, sigma: Array, pre: PreReconstructor, most: float) -> str:
+    """How far |Z0| (K,), known by sigma (K,), is from the bundle's skin untouched, to a person; "" where its rms
+    relative misfit is at most `most` beyond its noise.
     """
-    if pre.m.normalisation != "model":
-        return 0.0
+    known = np.isfinite(sigma) & (z0 > 0)
+    noise = float(np.sqrt(np.mean((sigma[known] / z0[known]) ** 2))) if known.any() else 0.0
+    misfit = implausibility(z0, pre)
+    if misfit <= np.hypot(most, noise):
+        return ""
+    return f"{100 * misfit:.1f} % off what the bundle predicts"
+
+
+def implausibility(z0: Array, pre: PreReconstructor) -> float:
+    """rms relative misfit of |Z0| to the bundle's prediction, up to gain and contact impedances, neither of which is
+    negative; 0 where the bundle predicts none.
+    """
     live = z0 > 0
-    relative = z0[live] / pre.m.z0[live]
-    gain = float(np.median(relative))
-    residual = relative / gain - 1
-    columns = np.column_stack([np.ones(int(live.sum())), pre.m.contact[live]])
-    fitted, *_ = np.linalg.lstsq(columns, residual, rcond=1e-6)
-    return float(np.sqrt(np.mean((residual - columns @ fitted) ** 2)))
+    if pre.m.normalisation != "model" or not live.any():
+        return 0.0
+    contact = pre.m.contact[live]  # of log |Z|, by the logarithm of each contact impedance
+    columns = np.column_stack([1 - contact.sum(axis=1), contact]) * (pre.m.z0[live] / z0[live])[:, None]
+    return float(nnls(columns, np.ones(int(live.sum())))[1] / live.sum() ** 0.5)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import PreReconstructor
-from services.estimation.initialisation.baseline import LEAST_NOISE, Baseline
+from services.estimation.initialisation.baseline import LEAST_NOISE, SEE, UNLIKE, Baseline, implausible
 from services.estimation.values import numbers
 from services.estimation.values.state import shaped
 
@@ -41,8 +41,12 @@ class References:
         """Another scan than a reference came."""
         self._row.clear()
 
-    def baseline(self, amplitude: Array, scan: int, board: str, sample_ns: int) -> Baseline | None:
-        """The baseline that this scan's |Z| (K,) is, NaN where a measurement failed; None where half of it did."""
+    def baseline(
+        self, amplitude: Array, scan: int, board: str, sample_ns: int, pre: PreReconstructor
+    ) -> Baseline | None:
+        """The baseline that this scan's |Z| (K,) is, NaN where a measurement failed; None where half of it did. It is
+        in doubt where `pre` predicts another skin.
+        """
         good = np.isfinite(amplitude) & (amplitude > 0)
         self.scan = scan
         if good.sum() < self._k / 2:
@@ -55,7 +59,9 @@ class References:
             self.typical = np.nan_to_num(_quietly(lambda scans: np.nanmedian(scans, axis=0), rows))
         z0, sigma = np.where(good, amplitude, 0.0), np.where(good, self.noise * amplitude, np.inf)
         # Two scans share each of the differences that it was found from.
-        return Baseline(z0, sigma, 1, board, sample_ns, taken_by="file", noise_frames=self._found_from // 2)
+        off = implausible(z0, sigma, pre, UNLIKE)
+        doubt = off and f"the reference is {off}: {SEE}"
+        return Baseline(z0, sigma, 1, board, sample_ns, doubt, taken_by="file", noise_frames=self._found_from // 2)
 
     def sigma(self, baseline: Baseline, pre: PreReconstructor) -> Array:
         """(K,) noise of d against this baseline: that of a typical scan, so that operators are made once for all."""
