@@ -38,6 +38,11 @@ class Memory:
     log_radius: float
     mixed: bool = False  # of whatever pressed while nothing explained the scans: it has no place
 
+    def most(self, at_s: float) -> float:
+        """Action that foam may remember at most at an instant."""
+        faded = float(np.exp(-max(0.0, at_s - self.at_s) / FADES_S).mean())
+        return float(n.MEMORY_MOST * self.action * faded)
+
     def at_place_of(self, other: Memory) -> bool:
         if self.mixed or other.mixed:
             return self is other
@@ -64,8 +69,7 @@ class Prediction:
     at_s: float
     x: Array
     p: Array
-    columns: Array  # (K, S) of the states that are seen
-    seen: NDArray[np.intp]  # (S,) their places in x
+    remainder_variance: Array  # (K,)
     cross_covariance: Array  # (N, K) P H^T
     shift: Array  # (K,) log |Z| over the baseline
     covariance: Array  # (K, K) of it
@@ -114,18 +118,19 @@ class SkinFilter:
 
     def predict(self, at_s: float, flicker: Array) -> Prediction:
         """flicker (E,): variances of the contact impedances' noise, of which a share is slow."""
-        now = self.now
-        passed_s = max(0.0, at_s - now.at_s)
+        passed_s = self._passed_s(at_s)
         x, p = self._moved(passed_s, flicker)
         columns, seen = self._columns()
         reach = p[:, seen] @ columns.T
         covariance = columns @ reach[seen]
-        covariance[np.diag_indices_from(covariance)] += now.remainder_variance + n.REMAINDER_WALK**2 * passed_s
-        return Prediction(at_s, x, p, columns, seen, reach, columns @ x[seen] + now.remainder, covariance)
+        remainder_variance = self.now.remainder_variance + n.REMAINDER_WALK**2 * passed_s
+        covariance[np.diag_indices_from(covariance)] += remainder_variance
+        shift = columns @ x[seen] + self.now.remainder
+        return Prediction(at_s, x, p, remainder_variance, reach, shift, covariance)
 
     def shift(self, at_s: float) -> Array:
-        """(K,) log |Z| over the baseline, predicted: the mean of `ahead` alone."""
-        now, passed_s = self.now, max(0.0, at_s - self.now.at_s)
+        """(K,) log |Z| over the baseline, predicted: `predict` without its covariance."""
+        now, passed_s = self.now, self._passed_s(at_s)
         x = now.x.copy()
         x[FIELD] += passed_s * x[RATES]
         if now.memories:
@@ -135,7 +140,7 @@ class SkinFilter:
 
     def common_mode_variance(self, at_s: float) -> float:
         """Of what all measurements share, but for contacts."""
-        p, passed_s = self.now.p, max(0.0, at_s - self.now.at_s)
+        p, passed_s = self.now.p, self._passed_s(at_s)
         return float(p[0, 0] + 2 * passed_s * p[0, MODES] + passed_s**2 * p[MODES, MODES])
 
     def inflated_process_noise(self, times: float = 1.0) -> Array:
@@ -152,23 +157,16 @@ class SkinFilter:
         p, modes = self.now.p, np.arange(MODES)
         p[modes, modes] += n.FASTER_STAYS * times * self._faster
         p[modes + MODES, modes + MODES] += n.FASTER_STAYS * self._faster
-        contacts = np.arange(self.contacts.start, self.contacts.stop)
+        contacts = np.r_[self.contacts]
         p[contacts, contacts] += n.FASTER_STAYS * (times - 1) * n.CONTACT_FASTER**2
 
     def update(self, predicted: Prediction, y: Array, white: Whitening) -> Array:
         """Learn from an untouched frame: y (K,) log |Z| over the prediction, white: of its covariance. Returns
         S^-1 y (K,).
         """
-        now = self.now
-        passed_s = max(0.0, predicted.at_s - now.at_s)
-        weighted_residual = white.solve(y)
-        gathered = white(predicted.cross_covariance.T)  # (K, N)
-        now.x = predicted.x + predicted.cross_covariance @ weighted_residual
-        now.p = predicted.p - gathered.T @ gathered
-        variance = now.remainder_variance + n.REMAINDER_WALK**2 * passed_s
-        now.remainder = now.remainder + variance * weighted_residual
-        now.remainder_variance = variance * (1 - variance * white.conditional_precisions())
-        now.at_s = predicted.at_s
+        weighted_residual, gathered = white.solve(y), white(predicted.cross_covariance.T)
+        posterior = predicted.p - gathered.T @ gathered
+        self._learn(predicted, weighted_residual, posterior, white.conditional_precisions())
         self._forget_the_faint()
         return weighted_residual
 
@@ -179,27 +177,27 @@ class SkinFilter:
         The state's posterior given a fit's own, with S = W^-1 W^-T, D its whitened design and C what it leaves open:
         P - P H^T W^T (1 - D C D^T) W H P.
         """
-        now, white = self.now, fit.white
-        passed_s = max(0.0, predicted.at_s - now.at_s)
-        reach = predicted.cross_covariance * grown
-        gathered = white(reach.T)  # (K, N)
-        beside = fit.design.T @ gathered
-        now.x = predicted.x + reach @ fit.weighted_residual
-        now.p = predicted.p - gathered.T @ gathered + beside.T @ (fit.solved @ beside)
-        told = fit.design.T @ white.w
-        precision = white.conditional_precisions() - np.sum(told * (fit.solved @ told), axis=0)
-        variance = now.remainder_variance + n.REMAINDER_WALK**2 * passed_s
-        now.remainder = now.remainder + variance * grown * fit.weighted_residual
-        now.remainder_variance = variance * (1 - variance * grown**2 * np.maximum(precision, 0.0))
-        now.at_s = predicted.at_s
+        gathered = fit.white((predicted.cross_covariance * grown).T)  # (K, N)
+        beside, design = fit.design.T @ gathered, fit.design.T @ fit.white.w
+        posterior = predicted.p - gathered.T @ gathered + beside.T @ (fit.solved @ beside)
+        precision = fit.white.conditional_precisions() - np.sum(design * (fit.solved @ design), axis=0)
+        self._learn(predicted, fit.weighted_residual, posterior, np.maximum(precision, 0.0), grown)
+
+    def _learn(
+        self, predicted: Prediction, weighted_residual: Array, p: Array, precision: Array, grown: Array | float = 1.0
+    ) -> None:
+        """p (N, N): posterior covariance of the states; precision (K,): of each measurement, all others given."""
+        now, variance = self.now, predicted.remainder_variance
+        now.x, now.p, now.at_s = predicted.x + predicted.cross_covariance * grown @ weighted_residual, p, predicted.at_s
+        now.remainder = now.remainder + variance * grown * weighted_residual
+        now.remainder_variance = variance * (1 - variance * grown**2 * precision)
 
     def more_memory(self) -> Array | None:
         """(K, K) covariance of memories that are as large as foam's may be; None where there is none."""
         memories = self.now.memories
         if not memories:
             return None
-        most = [n.MEMORY_MOST * memory.action * self._faded(memory, self.now.at_s) for memory in memories]
-        columns = np.array([share * memory.column for share, memory in zip(most, memories, strict=True)]).T
+        columns = np.array([memory.most(self.now.at_s) * memory.column for memory in memories]).T
         return np.asarray(columns @ columns.T)
 
     def may_remember(self, weighted_residual: Array) -> bool:
@@ -219,17 +217,11 @@ class SkinFilter:
             for places in ([k for k, m in enumerate(memories) if m.at_place_of(memory)] for memory in memories)
         )
 
-    @staticmethod
-    def _faded(memory: Memory, at_s: float) -> float:
-        """Share of what foam may remember at most that is left at an instant."""
-        return float(np.exp(-max(0.0, at_s - memory.at_s) / FADES_S).mean())
-
     def widen_memories(self) -> None:
         """They were larger than was expected."""
         now = self.now
         for place, memory in enumerate(now.memories):
-            own = self._own(place)
-            states = np.arange(own.start, own.stop)
+            states = np.r_[self._own(place)]
             now.p[states, states] += (n.MEMORY_SD * memory.action) ** 2
 
     def remembers(self, at_s: float) -> bool:
@@ -239,7 +231,7 @@ class SkinFilter:
     def remember(self, memory: Memory) -> None:
         """A touch went, or moved away."""
         now, size = self.now, len(self.now.x)
-        grown = np.exp(np.minimum(max(0.0, memory.at_s - now.at_s) / FADES_S, 20.0))  # the filter stands before that
+        grown = np.exp(np.minimum(self._passed_s(memory.at_s) / FADES_S, 20.0))  # the filter stands before that
         now.x = np.concatenate([now.x, memory.action * n.MEMORY_SHARE * grown])
         p = np.zeros((size + STATES_OF_MEMORY, size + STATES_OF_MEMORY))
         p[:size, :size] = now.p
@@ -256,13 +248,15 @@ class SkinFilter:
                 continue
             own = self._own(place)
             reach = predicted.cross_covariance[own].sum(axis=0)
-            left = float(predicted.x[own].sum() + reach @ weighted_residual)
+            remembered = float(predicted.x[own].sum() + reach @ weighted_residual)
             whitened = white(reach)
             variance = float(predicted.p[own, own].sum() - whitened @ whitened)
-            most = n.MEMORY_MOST * memory.action * self._faded(memory, predicted.at_s)
-            if left > most + n.MEMORY_SIGMAS * np.sqrt(max(variance, 0.0)):
+            if remembered > memory.most(predicted.at_s) + n.MEMORY_SIGMAS * np.sqrt(max(variance, 0.0)):
                 return memory
         return None
+
+    def _passed_s(self, at_s: float) -> float:
+        return max(0.0, at_s - self.now.at_s)
 
     def _own(self, place: int) -> slice:
         first = self._fixed + STATES_OF_MEMORY * place
@@ -283,11 +277,11 @@ class SkinFilter:
         grown[RATES] = self._rate_walk * passed_s
         grown[self.contacts] = (n.CONTACT_WALK**2 + n.CONTACT_FOLLOWS * flicker) * passed_s
         if count := len(self.now.memories):
-            kept = np.tile(np.exp(-passed_s / FADES_S), count)
+            fade = np.tile(np.exp(-passed_s / FADES_S), count)
             memories = slice(self._fixed, None)
-            x[memories] *= kept
-            p[memories] *= kept[:, None]
-            p[:, memories] *= kept
+            x[memories] *= fade
+            p[memories] *= fade[:, None]
+            p[:, memories] *= fade
             grown[memories] = (n.MEMORY_WALK * x[memories]) ** 2 * passed_s / np.tile(FADES_S, count)
         p[np.diag_indices_from(p)] += grown
         return x, p
@@ -297,9 +291,8 @@ class SkinFilter:
         if not self.now.memories:
             return self._lasting, self._lasting_seen
         memories = [memory.column for memory in self.now.memories for _ in range(STATES_OF_MEMORY)]
-        return np.hstack([self._lasting, np.array(memories).T]), np.r_[
-            self._lasting_seen, self._fixed : len(self.now.x)
-        ]
+        seen = np.r_[self._lasting_seen, self._fixed : len(self.now.x)]
+        return np.hstack([self._lasting, np.array(memories).T]), seen
 
     def _forget_the_faint(self) -> None:
         """Memories that no scan shows any more, and the oldest of too many, become each measurement's own remainder."""
@@ -312,8 +305,8 @@ class SkinFilter:
                 continue
             now.remainder = now.remainder + memory.column * share
             now.remainder_variance = now.remainder_variance + memory.column**2 * variance
-            kept = np.r_[0 : own.start, own.stop : len(now.x)]
-            now.x, now.p = now.x[kept], now.p[np.ix_(kept, kept)]
+            others = np.r_[0 : own.start, own.stop : len(now.x)]
+            now.x, now.p = now.x[others], now.p[np.ix_(others, others)]
             del now.memories[place]
 
 
