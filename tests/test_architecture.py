@@ -31,8 +31,8 @@ SERVICES_USE_OF_MODELS |= {*"prereconstruction pressure rolling shapes symmetrie
 # What services/estimation may import of the project
 NUMERICS = ("models", "services.estimation", "protocol.frames", "protocol.frame_types", "protocol.errors")
 # Rooms of the estimator, each of which stands on those before it, on values and on models/measurement
-ROOMS = ("filter", "overlap", "touches", "hypotheses.hypotheses", "tared", "hypotheses.selection", "track_update")
-ROOMS += ("estimator",)
+ROOMS = ("filter", "overlap", "track", "touches", "hypotheses.hypotheses", "tared", "hypotheses.selection")
+ROOMS += ("track_update", "scan_step", "estimator")
 # What of the standard library reads or writes files, sockets or processes
 OUTSIDE_WORLD = {"os", "socket", "pathlib", "tempfile", "shutil", "subprocess", "threading", "time"}
 

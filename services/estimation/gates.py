@@ -11,14 +11,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.noise import BURST_BLOCK
+from models.measurement.covariance.noise import BURST_BLOCK, NoiseModel
 from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import KnownWhitening, Turned
 from models.measurement.responses.response import DiscGrid
 from services.estimation.filter import FilterState, SkinFilter
-from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, ScoredAnswer
+from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
-from services.estimation.values.scan import Scan
 
 Array = NDArray[np.float64]
 
@@ -41,7 +40,7 @@ class Glance:
     newest: dict[int, Newest] = field(default_factory=dict)  # by the part measured last
 
     @cached_property
-    def told_of_even(self) -> float:
+    def common_information(self) -> float:
         """Information of what all values have in common."""
         return float(np.sum(self.white.w.sum(axis=1) ** 2))
 
@@ -56,7 +55,7 @@ class Glance:
 
 
 @dataclass(frozen=True)
-class HeldGlance:
+class SteadyGlance:
     """Of scans that are disturbed alike, under the same touches."""
 
     at_s: float
@@ -82,65 +81,52 @@ class NullGate:
     replay would miss.
     """
 
-    def __init__(self, grid: DiscGrid) -> None:
-        self._grid = grid
+    def __init__(self, grid: DiscGrid, noise: NoiseModel, drift: SkinFilter) -> None:
+        self._grid, self._noise, self._drift = grid, noise, drift
         self._glances: dict[int, Glance] = {}
-        self._held: dict[int, HeldGlance] = {}
+        self._steady: dict[int, SteadyGlance] = {}
 
     def forget(self) -> None:
         """The untouched skin is another."""
         self._glances.clear()
-        self._held.clear()
+        self._steady.clear()
 
-    def keep(
-        self,
-        alike: int,
-        at_s: float,
-        ids: tuple[int, ...],
-        innovation: Innovation,
-        answer: ScoredAnswer,
-        common_mode_variance: float,
-    ) -> None:
+    def keep(self, measured: Observation, ids: tuple[int, ...], innovation: Innovation, answer: ScoredAnswer) -> None:
         """Of a scan with which nothing is wrong; ids: of what touches."""
-        self._held.pop(alike, None)
+        alike, at_s = self._noise.alike(measured.scan.part), measured.middle_s
+        self._steady.pop(alike, None)
         if (fit := answer.fit) is None:
-            self._glances[alike] = Glance(at_s, innovation.white, common_mode_variance)
+            self._glances[alike] = Glance(at_s, innovation.white, self._drift.common_mode_variance(at_s))
         elif answer.cause == AS_IT_IS and answer.explained:
-            self._held[alike] = HeldGlance(at_s, ids, innovation.covariance, fit.known, fit.turned)
+            self._steady[alike] = SteadyGlance(at_s, ids, innovation.covariance, fit.known, fit.turned)
 
-    def held(self, alike: int, at_s: float, ids: tuple[int, ...]) -> HeldGlance | None:
+    def steady(self, measured: Observation, ids: tuple[int, ...]) -> SteadyGlance | None:
         """None: nothing is known of such scans under these touches."""
-        found = self._held.get(alike)
-        return found if found is not None and found.ids == ids and 0 <= at_s - found.at_s < n.GLANCE_S else None
+        found = self._steady.get(self._noise.alike(measured.scan.part))
+        return found if found is not None and found.ids == ids and _lately(found.at_s, measured) else None
 
-    def look(
-        self,
-        alike: int,
-        scan: Scan,
-        at_s: float,
-        y: Array,
-        information: NDArray[np.float32],
-        common_mode_variance: float,
-    ) -> Seen | None:
-        """y (K,): log |Z| over the prediction, 0 where it does not count. common_mode_variance: by now. None: nothing
-        is known of such scans, or the filter has become so much surer since that it would overlook a step of the gain.
+    def look(self, measured: Observation, y: Array, information: NDArray[np.float32]) -> Seen | None:
+        """y (K,): log |Z| over the prediction, 0 where it does not count. None: nothing is known of such scans, or the
+        filter has become so much surer since that it would overlook a step of the gain.
         """
-        known = self._glances.get(alike)
-        if (
-            known is None
-            or not 0 <= at_s - known.at_s < n.GLANCE_S
-            or common_mode_variance < n.SURER * known.common_mode_variance
-        ):
+        known = self._glances.get(self._noise.alike(measured.scan.part))
+        if known is None or not _lately(known.at_s, measured):
+            return None
+        if self._drift.common_mode_variance(measured.middle_s) < n.SURER * known.common_mode_variance:
             return None
         residual = known.white(y)
         weighted_residual = known.white.w.T @ residual
         chi2 = float(residual @ residual) / max(int(np.count_nonzero(y)), 1)
-        newest = known.newest_of(scan.part, scan.ages_s)
+        newest = known.newest_of(measured.scan.part, measured.scan.ages_s)
         own = weighted_residual[newest.rows]
         fresh = float(own @ newest.energy @ own) - len(own)
         z2 = max(self._grid.likeliest(weighted_residual, information)[0], fresh)
-        even = float(weighted_residual.sum()) ** 2 / known.told_of_even < n.GAIN_Z2
+        even = float(weighted_residual.sum()) ** 2 / known.common_information < n.GAIN_Z2
         return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, z2, weighted_residual, y)
+
+
+def _lately(at_s: float, measured: Observation) -> bool:
+    return 0 <= measured.middle_s - at_s < n.GLANCE_S
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from services.estimation.delayed_update import DelayedUpdate, LearningState
 from services.estimation.faults.board import BoardFaults, FaultState
 from services.estimation.faults.isolation import FaultIsolation
 from services.estimation.faults.table import any_touches
+from services.estimation.faults.wires import WireFault
 from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, Memory, SkinFilter
 from services.estimation.gates import NullGate, SlowOnsetTest, SlowState
 from services.estimation.hypotheses.hypotheses import Hypotheses
@@ -46,6 +47,15 @@ class KnownBaseline(NamedTuple):
         covariance[np.diag_indices_from(covariance)] += self.scatter**2 / self.frames
         leave_out(covariance, self.live)
         return EarlierBaseline(self.log_z0, covariance)
+
+
+class GridInformation(NamedTuple):
+    """Of the grid's discs, made now and then and under other wires or measurements."""
+
+    each: NDArray[np.float32]  # (A,)
+    wholes: int  # EstimatorState.wholes then
+    live: NDArray[np.bool_]
+    wire: WireFault | None
 
 
 @dataclass
@@ -79,19 +89,19 @@ class TaredSkin:
         self.learning = DelayedUpdate(self.drift, self.noise)
         self.slow_onset = SlowOnsetTest(self.drift)
         self.refused = UnexplainedLoad(tables.measurements)
-        self.null_gate = NullGate(self.hypotheses.grid)
+        self.null_gate = NullGate(self.hypotheses.grid, self.noise, self.drift)
+        self.grid_information: GridInformation | None = None
         self.aged = list[FilterState]()
         self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
         self.isolation = FaultIsolation(self.tables, self.noise, self.touches, self.hypotheses, self.faults)
 
-    def begin(self, scans: AgreedScans, next_id: int) -> None:
+    def begin(self, scans: AgreedScans) -> None:
         """scans: those of the baseline."""
         self.noise.begin(scans.residuals, scans.parts)
         self.noise.now.white = max(self.noise.now.white, scans.least_white)
         self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / self.frames)
-        self.touches.now.next_id = next_id
 
-    def adopt(self, next_id: int, contact_per_s: float, age_s: float) -> None:
+    def adopt(self, contact_per_s: float, age_s: float) -> None:
         """The baseline was taken age_s before the next scan, and nobody watched since. How far the skin has drifted is
         a mixture: as far as in each of AGES of that time. The first scan weighs them (`aged`). contact_per_s: relative,
         by which contact impedances change.
@@ -101,24 +111,35 @@ class TaredSkin:
         for share in n.AGES if age_s else n.AGES[-1:]:
             self.drift.begin(0.0, np.zeros(self.tables.electrodes), share * age_s)
             contact_sd = min(contact_per_s * share * age_s, float(n.START_CONTACT))
-            contacts = np.arange(self.drift.contacts.start, self.drift.contacts.stop)
+            contacts = np.r_[self.drift.contacts]
             self.drift.now.p[contacts, contacts] = n.CONTACT_START**2 + contact_sd**2
             bends = n.CONTACT_BENDS * contact_sd * np.linalg.norm(self.tables.contact, axis=1)
             self.drift.now.remainder_variance += self.scatter**2 / self.frames + bends**2
             self.drift.now.at_s = -share * age_s
             self.aged.append(self.drift.now)
-        self.touches.now.next_id, self.touches.now.watched = next_id, False
+        self.touches.now.watched = False
+
+    @property
+    def _learners(self) -> dict[str, Any]:
+        """What has a state of its own, by its name in TaredState."""
+        return {
+            "noise": self.noise,
+            "lines": self.noise.lines,
+            "drift": self.drift,
+            "touches": self.touches,
+            "learning": self.learning,
+            "faults": self.faults,
+            "refused": self.refused,
+            "slow": self.slow_onset,
+        }
 
     def with_tables(self, tables: SkinTables) -> TaredSkin:
         """The same baseline and all that was learnt, with other tables of the same skin."""
         made = TaredSkin(tables, self.baseline)
-        made.noise.now, made.noise.lines.now = self.noise.now, self.noise.lines.now
-        made.touches.now, made.learning.now = self.touches.now, self.learning.now
-        made.faults.now = self.faults.now
-        made.hypotheses.process_noise_scale, made.hypotheses.wide = (
-            self.hypotheses.process_noise_scale,
-            self.hypotheses.wide,
-        )
+        for name in ("noise", "lines", "touches", "learning", "faults"):
+            made._learners[name].now = self._learners[name].now
+        made.hypotheses.process_noise_scale = self.hypotheses.process_noise_scale
+        made.hypotheses.wide = self.hypotheses.wide
         made.drift.succeed(self.drift)
         return made
 
@@ -127,29 +148,15 @@ class TaredSkin:
         for memory in memories:
             self.drift.remember(memory)
         if memories:
-            self.forget_gates()
-
-    def forget_gates(self) -> None:
-        """The untouched skin is another than at the last scans."""
-        self.null_gate.forget()
+            self.null_gate.forget()
 
     def state(self) -> TaredState:
         """What a whitening of a moment ago told is forgotten: who goes on from this state does not have it."""
-        self.forget_gates()
-        return TaredState(
-            baseline=self.baseline,
-            noise=self.noise.now,
-            lines=self.noise.lines.now,
-            drift=self.drift.now,
-            touches=self.touches.now,
-            learning=self.learning.now,
-            faults=self.faults.now,
-            refused=self.refused.now,
-            slow=self.slow_onset.now,
-            process_noise_scale=self.hypotheses.process_noise_scale,
-            wide=self.hypotheses.wide,
-            aged=self.aged,
-        )
+        self.null_gate.forget()
+        self.grid_information = None
+        learnt = {name: each.now for name, each in self._learners.items()}
+        scale, wide = self.hypotheses.process_noise_scale, self.hypotheses.wide
+        return TaredState(self.baseline, **learnt, process_noise_scale=scale, wide=wide, aged=self.aged)
 
     def load(self, state: TaredState) -> None:
         """Raises ValueError where the drift's covariance is none."""
@@ -159,12 +166,7 @@ class TaredSkin:
             raise ValueError(
                 f"the drift's covariance: found {len(spread)} states, {spread[0]:.1g}, expected {size}, >= 0"
             )
-        self.noise.now, self.noise.lines.now = state.noise, state.lines
-        self.drift.now, self.touches.now = state.drift, state.touches
-        self.learning.now, self.faults.now, self.refused.now = state.learning, state.faults, state.refused
-        self.slow_onset.now = state.slow
-        self.hypotheses.process_noise_scale, self.hypotheses.wide, self.aged = (
-            state.process_noise_scale,
-            state.wide,
-            state.aged,
-        )
+        for name, each in self._learners.items():
+            each.now = getattr(state, name)
+        self.hypotheses.process_noise_scale, self.hypotheses.wide = state.process_noise_scale, state.wide
+        self.aged = state.aged

@@ -7,7 +7,7 @@ from models.shapes import Shape, drop_image
 from protocol.frame_types import REASONS, VERDICTS
 from protocol.frames import STATUS_OPEN, DeltaFrame, JudgementsFrame, PartFrame, RawFrame, pack, unpack
 from services.estimation.images.quality import Residual
-from services.estimation.touches import coasted
+from services.estimation.track import coasted
 from services.estimation.values.estimate import TouchEstimate
 from services.estimation.values.judgement import ROWS, Verdict, judge, reasons, valid
 from services.estimation.values.scan import Scan

@@ -82,7 +82,7 @@ class ContactOrTouchTest:
         """(K,) log |Z| over a skin with what is decided, touches that stand taken off."""
         faults = self._faults
         known = faults.columns.settled_mean() + faults.columns.mean(faults.now.contact, faults.now.doubt.decided)
-        touched = np.exp(view.y) - np.exp(answer.left)
+        touched = np.exp(view.y) - np.exp(answer.residual)
         left = np.expm1(np.minimum(view.log_z - view.sound, n.MISFIT_MOST)) - touched - known
         return np.where(view.live, np.log1p(np.maximum(left, LEAST)), 0.0)
 

@@ -47,7 +47,7 @@ class FaultIsolation:
         """
         faults = self._faults
         skin, own = self._covariances(at)
-        standing = self._touches.expected(at.middle_s, at.span_s)
+        standing = self._touches.expected(at)
 
         def rewired(view: BoardView) -> bool:
             if not faults.suspects_wires(view):
@@ -117,8 +117,8 @@ class FaultIsolation:
                 continue
             if not asked or track.ended or not self._faults.on_electrode(track.state):
                 continue
-            standing = self._touches.expected(at.middle_s, at.span_s)
-            loose = self._touches.expected(at.middle_s, at.span_s, loose=True)
+            standing = self._touches.expected(at)
+            loose = self._touches.expected(at, manoeuvring=True)
             del standing[k], loose[k]
             touched, nearby = self._change(standing, at, but=k)
             ask = partial(self._with, standing, loose)
@@ -138,12 +138,12 @@ class FaultIsolation:
         if not self._faults.now.doubt.undecided or self._faults.now.wire is not None:
             return
         skin, own = self._covariances(at)
-        touched, nearby = self._change(self._touches.expected(at.middle_s, at.span_s), at)
+        touched, nearby = self._change(self._touches.expected(at), at)
         misfit = self._tables.misfit_of(float(touched @ touched))
         touch = self._contact_doubt(found, skin + nearby + misfit, own)
         if touch is not None:
             self._faults.drop_contact()
-            self._touches.tell(touch, at.middle_s, at.span_s)
+            self._touches.tell(touch, at)
         elif self._faults.now.contact < 0:
             for track in self._touches.now.tracks:
                 track.told_from_contact = self._faults.on_electrode(track.state)

@@ -1,8 +1,7 @@
 """What may explain a scan, in order, all scored in one table of log evidence: nothing new; a touch that ended, moved or
-began; faster drift; a disturbance; a response that is wrong by more. Each owns something wider than the filter's own
-walk, so that none of them can be locked out. The likeliest of those that explain the scan is taken.
-
-The order is a budget in solver steps, never in time: a replay decides as the session did.
+began; faster drift; a disturbance; a response that is wrong by more. The likeliest of those that explain it is taken.
+Each owns something wider than the filter's own walk, so that none can be locked out. How many are asked is a budget in
+solver steps, never in time: a replay decides as the session did.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from models.measurement.touch import (
     plain,
 )
 from services.estimation.filter import SkinFilter
-from services.estimation.hypotheses.detector import TouchDetector, fresh
+from services.estimation.hypotheses.detector import TouchDetector, newest_z2
 from services.estimation.hypotheses.innovation import (
     AS_IT_IS,
     BURST,
@@ -46,7 +45,6 @@ from services.estimation.hypotheses.innovation import (
     ScoredAnswer,
     likeliest,
     started,
-    started_from,
 )
 from services.estimation.overlap import apart, neighbours
 from services.estimation.values import numbers as n
@@ -61,42 +59,30 @@ WIDER = (MEMORY, DRIFT, BURST, NOISE)
 
 
 @dataclass(frozen=True)
-class AChange:
-    """How strongly one of the touches that stand acts, changed at once. at_s: -inf: before the scan; inf: one that was
-    said to have ended goes on. left: what of it is left; 0: it ended.
+class StrengthStep:
+    """One of the tracked touches acts otherwise at once. at_s: -inf: before the scan; inf: one that was taken for ended
+    goes on. share: of its action after that; 0: it ended.
     """
 
     touch: int
     at_s: float
-    left: float
-
-
-@dataclass(frozen=True)
-class Releases:
-    """Of one touch, at once, at each of several instants of a scan."""
-
-    ends_s: Array  # (n,) from the middle of the scan; the first is its begin
-    ramp_s: float  # for which it goes
-    beside: Array  # (K,) relative change while it lasts, by all touches
-    missing: Array  # (K, n) of that, after each
-
-    def instant(self, at: int) -> float:
-        """Of an end; -inf: before the scan."""
-        return -np.inf if at == 0 and self.ramp_s == AT_ONCE_S else float(self.ends_s[at])
+    share: float
 
 
 def _releases(
     course: TouchCourse, innovation: Innovation, prior: TouchPrior, own: Array, others: Array
-) -> Iterator[Releases]:
-    """own, others (K,): relative change by this touch as it stands, and by the other ones."""
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Of a touch that ends at once, for each of some ramps: (n,) instants; (K,) relative change by all touches before;
+    (K, n) what of it is missing after each. own, others (K,): by this touch as it goes on, and by the other ones.
+    """
     ends_s = np.concatenate([[-0.5 * innovation.span_s], innovation.instants])
     if prior.until_s < np.inf:
         own = course.columns(prior.start[None], [replace(prior, until_s=np.inf)]).mean
         ends_s = np.append(ends_s, np.inf)
-    beside = others + own
     for ramp_s in RAMPS_S:
         acts = np.clip(0.5 + (ends_s - innovation.times_s[:, None]) / ramp_s, 0.0, 1.0)
-        yield Releases(ends_s, ramp_s, beside, own[:, None] * (acts - 1))
+        at_s = np.append(-np.inf, ends_s[1:]) if ramp_s == AT_ONCE_S else ends_s
+        yield at_s, others + own, own[:, None] * (acts - 1)
 
 
 class Hypotheses:
@@ -130,16 +116,15 @@ class Hypotheses:
     def untouched(self, innovation: Innovation, cause: str = AS_IT_IS, more: Array | None = None) -> ScoredAnswer:
         """The answer that nothing touches; more (K, K): what a cause adds to the covariance."""
         white = innovation.white if more is None else Whitening.of(innovation.covariance + more)
-        residual = white(innovation.y)
-        weighted_residual = white.w.T @ residual
-        z2 = max(
-            self.detector.best(innovation, weighted_residual, white)[0], fresh(innovation, weighted_residual, white)
-        )
-        score = white.log_density - 0.5 * float(residual @ residual) + LOG_PRIORS[cause]
-        chi2 = float(residual @ residual) / max(int(innovation.live.sum()), 1)
+        whitened = white(innovation.y)
+        energy = float(whitened @ whitened)
+        score = white.log_density - 0.5 * energy + LOG_PRIORS[cause]
+        chi2 = energy / max(int(innovation.live.sum()), 1)
+        answer = ScoredAnswer(cause, None, (), chi2, np.inf, score, white, white.w.T @ whitened, innovation.y)
+        z2 = max(self.detector.best(innovation, answer).z2, newest_z2(innovation, answer))
         if not self._tables.predicted:
             z2 = max(z2, float(n.FALSE_ALARM_Z2 / n.QUIET) * chi2)
-        return ScoredAnswer(cause, None, (), chi2, z2, score, white, weighted_residual, innovation.y)
+        return replace(answer, next_touch_z2=z2)
 
     def _untouched(self, innovation: Innovation, causes: Sequence[str]) -> list[ScoredAnswer]:
         """The same, also by each of the causes that this skin has, where foam may remember as much."""
@@ -181,33 +166,20 @@ class Hypotheses:
             return None
         return best if float(best.fit.states[:, ACTION].sum()) > n.START_SEEN else None
 
-    def ask(self, innovation: Innovation, standing: Priors, loose: Priors) -> ScoredAnswer:
-        """The likeliest answer. standing, loose: what is known of the touches that there were, as they were and where
-        they may have begun to move or to change.
+    def ask(self, innovation: Innovation, tracked: Priors, manoeuvring: Priors) -> ScoredAnswer:
+        """The likeliest answer. tracked, manoeuvring: what is known of the touches that there were, if they go on as
+        they did, and if they have begun to move or to change.
         """
-        if standing:
-            answers = self._of_standing(innovation, standing, loose)
+        if tracked:
+            answers = self._of_tracked(innovation, tracked, manoeuvring)
         else:
             answers = [*self._untouched(innovation, self._wider), *self._from_nothing(innovation)]
         if not _settled(innovation, answers):
-            answers += self._of_anything(innovation, standing, answers)
+            answers += self._of_anything(innovation, tracked, answers)
         best = likeliest(answers)
-        if standing:
+        if tracked:
             return best
         return replace(best, over=best.score - max(answer.score for answer in answers if answer.fit is None))
-
-    def narrow(self, innovation: Innovation, standing: Priors) -> ScoredAnswer:
-        """The answer that touches stay as they are, by a response that is wrong by no more than it should be."""
-        return self.fitted(innovation, standing, tuple(range(len(standing))), n.STEPS_WARM, wide=False)
-
-    def goes_on(self, innovation: Innovation, standing: Priors, known: KnownWhitening, turned: Turned) -> ScoredAnswer:
-        """The answer that touches stay as they are; known, turned: of a moment ago, when they did."""
-        everyone = tuple(range(len(standing)))
-        return self.fitted(innovation, standing, everyone, n.STEPS_HELD, known=known, turned=turned)
-
-    def at(self, innovation: Innovation, x: float, y: float) -> ScoredAnswer:
-        """The answer that something touches there."""
-        return self.fitted(innovation, [anywhere(x, y, 0.0, innovation.span_s)], (-1,), n.STEPS_COLD)
 
     def on_electrode(self, innovation: Innovation, place: Array, second: Array) -> ScoredAnswer:
         """The likeliest small touch on an electrode. place (2,): its middle; second (K, n): what a touch does there
@@ -222,18 +194,18 @@ class Hypotheses:
             action = 0.0 if found is None or found.fit is None else float(found.fit.states[0, ACTION])
             more = action**2 * second
             wider = replace(innovation, covariance=innovation.covariance + more @ more.T)
-            answer = self.fitted(wider, [prior], (-1,), n.STEPS_COLD)
+            answer = self.fitted(wider, [prior], (-1,))
             if found is None or answer.score > found.score:
                 found = answer
         assert found is not None
         return found
 
-    def without(self, innovation: Innovation, standing: Priors, place: int) -> ScoredAnswer:
+    def without(self, innovation: Innovation, tracked: Priors, place: int) -> ScoredAnswer:
         """The answer that one of the touches is none: there is nothing, or it is drift, or what foam remembers."""
-        association = tuple(k for k in range(len(standing)) if k != place)
+        association = tuple(k for k in range(len(tracked)) if k != place)
         if not association:
             return likeliest(self._untouched(innovation, (DRIFT, MEMORY)))
-        priors = [standing[k] for k in association]
+        priors = [tracked[k] for k in association]
         answers = [self.fitted(innovation, priors, association, n.STEPS_WARM)]
         for cause in (DRIFT, MEMORY):
             answers += self.with_cause(innovation, priors, association, cause, innovation.y, n.STEPS_WARM)
@@ -248,76 +220,69 @@ class Hypotheses:
         settled = innovation.spent or (count == 1 and _settled(innovation, found))
         return found if settled else [*found, *self.search(innovation)]
 
-    def _of_standing(self, innovation: Innovation, standing: Priors, loose: Priors) -> list[ScoredAnswer]:
+    def _of_tracked(self, innovation: Innovation, tracked: Priors, manoeuvring: Priors) -> list[ScoredAnswer]:
         answers = list[ScoredAnswer]()
-        for further in self._of_changes(innovation, standing, loose):
+        for further in self._of_changes(innovation, tracked, manoeuvring):
             answers += further
             if _settled(innovation, answers):
                 return answers
-        return answers + self._beside_standing(innovation, standing, loose, answers)
+        return answers + self._beside_tracked(innovation, tracked, manoeuvring, answers)
 
-    def _of_changes(self, innovation: Innovation, standing: Priors, loose: Priors) -> Iterator[list[ScoredAnswer]]:
+    def _of_changes(self, innovation: Innovation, tracked: Priors, manoeuvring: Priors) -> Iterator[list[ScoredAnswer]]:
         """The same touches, one way after the other: as they were, gone, begun, changed or ended at once, moved."""
-        everyone = tuple(range(len(standing)))
-        unchanged = self.fitted(innovation, standing, everyone, n.STEPS_WARM)
+        unchanged = self.fitted(innovation, tracked, most_steps=n.STEPS_WARM)
         yield [unchanged]
         yield [self.untouched(innovation)]  # costs no step
         if -1 in innovation.places:
-            yield self._continued(innovation, loose)
-        if (begun := self._begun_otherwise(innovation, standing)) is not None:
-            yield [self.fitted(innovation, begun, everyone, n.STEPS_COLD)]
-        end, turn = self._changes(innovation, standing, unchanged)
+            yield self._continued(innovation, manoeuvring)
+        if (begun := self._begun_otherwise(innovation, tracked)) is not None:
+            yield [self.fitted(innovation, begun)]
+        end, turn = self._changes(innovation, tracked, unchanged)
         late = end is None or end.at_s > _turns_s(innovation) + TURN_STEPS[0]
         ways = (self._released, end), (self._turned, turn)
         for how, change in reversed(ways) if late else ways:
-            yield how(innovation, standing, change)
-        yield [self.fitted(innovation, loose, everyone, n.STEPS_COLD)]
+            yield how(innovation, tracked, change)
+        yield [self.fitted(innovation, manoeuvring)]
 
-    def _beside_standing(
-        self, innovation: Innovation, standing: Priors, loose: Priors, before: Sequence[ScoredAnswer]
+    def _beside_tracked(
+        self, innovation: Innovation, tracked: Priors, manoeuvring: Priors, before: Sequence[ScoredAnswer]
     ) -> list[ScoredAnswer]:
-        """Further touches beside those that stand, or a disturbance; before: the answers without."""
-        everyone = tuple(range(len(standing)))
-        expected = self.fitted(innovation, standing, everyone, 0)
-        causes = CAUSE_STEPS * len(self._wider) * len(loose)  # a search must not spend theirs
+        """Further touches beside the tracked ones, or a disturbance; before: the answers without."""
+        expected = self.fitted(innovation, tracked, most_steps=0)
+        causes = CAUSE_STEPS * len(self._wider) * len(manoeuvring)  # a search must not spend theirs
         found = self.search(replace(innovation, keeps=innovation.keeps + causes), expected)
-        left = likeliest([*before, *found]).left
+        residual = likeliest([*before, *found]).residual
         for cause in self._affordable(innovation):
-            found += self.with_cause(innovation, loose, everyone, cause, left)
+            found += self.with_cause(innovation, manoeuvring, None, cause, residual)
         return found
 
-    def _continued(self, innovation: Innovation, loose: Priors) -> list[ScoredAnswer]:
-        """What nearly explained the part before, a step further: those that stand, and the new ones beside them; or
+    def _continued(self, innovation: Innovation, manoeuvring: Priors) -> list[ScoredAnswer]:
+        """What nearly explained the part before, a step further: the tracked touches, and the new ones beside them; or
         foam remembers more of what went.
         """
-        priors, association = list(loose), list(range(len(loose)))
+        priors, association = list(manoeuvring), list(range(len(manoeuvring)))
         for candidate, place in zip(innovation.candidates, innovation.places, strict=True):
             if place < 0:
                 priors.append(candidate)
                 association.append(-1)
             else:
                 priors[place] = replace(priors[place], start=candidate.start)
-        found = self.fitted(innovation, priors, tuple(association), n.STEPS_COLD)
-        everyone = tuple(range(len(loose)))
-        return [found, *self.with_cause(innovation, loose, everyone, MEMORY, innovation.y, n.STEPS_WARM)]
+        found = self.fitted(innovation, priors, tuple(association))
+        return [found, *self.with_cause(innovation, manoeuvring, None, MEMORY, innovation.y, n.STEPS_WARM)]
 
     def _of_anything(
-        self, innovation: Innovation, standing: Priors, before: Sequence[ScoredAnswer]
+        self, innovation: Innovation, tracked: Priors, before: Sequence[ScoredAnswer]
     ) -> list[ScoredAnswer]:
         """Where what was known does not help: touches from nothing, beside a disturbance, by a wrong response."""
-        found = self._from_nothing(innovation) if standing else []
-        if _settled(innovation, found):
-            return found
+        found = self._from_nothing(innovation) if tracked else []
         touched = [answer for answer in [*before, *found] if answer.fit is not None]
-        if not touched:
+        if not touched or _settled(innovation, found):
             return found
         best = likeliest(touched)
-        assert best.fit is not None
-        again = started_from(best.fit)
+        again = started(best.fit)
         for cause in self._affordable(innovation):
-            found += self.with_cause(innovation, again, best.association, cause, best.left)
-        found.append(self.fitted(innovation, again, best.association, n.STEPS_COLD, wide=True))
-        return found
+            found += self.with_cause(innovation, again, best.association, cause, best.residual)
+        return [*found, self.fitted(innovation, again, best.association, wide=True)]
 
     def _affordable(self, innovation: Innovation) -> Iterator[str]:
         """The wider causes, as long as there are steps for them."""
@@ -327,36 +292,32 @@ class Hypotheses:
         self,
         innovation: Innovation,
         priors: Priors,
-        association: tuple[int, ...],
+        association: tuple[int, ...] | None,
         cause: str,
-        left: Array,
+        residual: Array,
         most_steps: float = n.STEPS_COLD,
     ) -> list[ScoredAnswer]:
         """Empty where this skin has no such cause, or foam no such memory."""
-        more = self._more(innovation, cause, left)
+        more = self._more(innovation, cause, residual)
         if more is None:
             return []
         wider = replace(innovation, covariance=innovation.covariance + more)
         answer = self.fitted(wider, priors, association, most_steps, cause)
         return [answer] if self._may_be(answer) else []
 
-    def _more(self, innovation: Innovation, cause: str, left: Array) -> Array | None:
-        """(K, K) what a cause adds to the covariance; left (K,): the residual that it is to explain."""
+    def _more(self, innovation: Innovation, cause: str, residual: Array) -> Array | None:
+        """(K, K) what a cause adds to the covariance; residual (K,): what it is to explain."""
         if cause == DRIFT:
             return self.inflated_drift()
         if cause == MEMORY:
             return self._drift.more_memory()
         if cause == BURST:
-            lines = self._noise.disturbing(innovation.part)
+            lines = self._noise.disturbing(innovation.scan.part)
             return in_blocks(lines, innovation.order, n.BURST) if lines.shape[1] else None
-        return self._grown(innovation, left)
-
-    def _grown(self, innovation: Innovation, left: Array) -> Array | None:
-        """Each block of measurements with a noise of its own."""
-        block = innovation.order // BURST_BLOCK
+        block = innovation.order // BURST_BLOCK  # each block of measurements with a noise of its own
         count = np.bincount(block)
         expected = np.bincount(block, np.diag(innovation.covariance)) / count
-        excess = np.maximum(np.bincount(block, left**2) / count - expected, 0.0)
+        excess = np.maximum(np.bincount(block, residual**2) / count - expected, 0.0)
         excess[excess < 2 * expected] = 0.0
         if not excess.any() or excess.max() > n.MOST_NOISE**2:  # under more nothing would be seen
             return None
@@ -368,43 +329,32 @@ class Hypotheses:
         self,
         innovation: Innovation,
         priors: Priors,
-        association: tuple[int, ...],
-        most_steps: float,
+        association: tuple[int, ...] | None = None,
+        most_steps: float = n.STEPS_COLD,
         cause: str = AS_IT_IS,
         wide: bool | None = None,
         known: KnownWhitening | None = None,
         turned: Turned | None = None,
     ) -> ScoredAnswer:
+        """association: None: each of the priors is of the tracked touch in its place. known, turned: of a moment ago,
+        where they are as good as this scan's own.
+        """
+        association = tuple(range(len(priors))) if association is None else association
         wide = self.wide if wide is None else wide
         course = TouchCourse(self.response, innovation.times_s, innovation.span_s)
-        live = int(innovation.live.sum())
-        misfit = max(float(MISFIT_WIDE), 2 * self._tables.wrong) if wide else self._tables.wrong
-        covariance = (
-            innovation.covariance if self._tables.map is None else innovation.covariance + self._tables.map.error
-        )
-        scene = FittedScan(
-            innovation.y, covariance, course, self._tables.misfit, live, known, turned, innovation.sample_s
-        )
-        may = max(0.0, innovation.budget.left - innovation.keeps) / len(priors)
-        fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(may)))
+        live, tables = int(innovation.live.sum()), self._tables
+        misfit = max(float(MISFIT_WIDE), 2 * tables.wrong) if wide else tables.wrong
+        covariance = innovation.covariance if tables.map is None else innovation.covariance + tables.map.error
+        scene = FittedScan(innovation.y, covariance, course, tables.misfit, live, known, turned, innovation.sample_s)
+        affordable = max(0.0, innovation.budget.left - innovation.keeps) / len(priors)
+        fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(affordable)))
         innovation.budget.left -= (fit.steps + 1) * len(fit)
-        z2 = self.detector.best(innovation, fit.weighted_residual, fit.white, fit)[0]
         cost = n.LOG_PRIOR_WIDE if wide and not self.wide else LOG_PRIORS[cause]
         score = fit.evidence + cost + innovation.touch_log_prior * sum(place < 0 for place in association)
-        near = innovation.by_evidence and not apart(fit.states, association)
-        return ScoredAnswer(
-            cause,
-            fit,
-            association,
-            fit.chi2,
-            z2,
-            score,
-            fit.white,
-            fit.weighted_residual,
-            fit.left,
-            near=near,
-            wide=wide,
-        )
+        near = innovation.whole and not apart(fit.states, association)
+        told = fit.chi2, np.inf, score, fit.white, fit.weighted_residual, fit.left
+        answer = ScoredAnswer(cause, fit, association, *told, near=near, wide=wide)
+        return replace(answer, next_touch_z2=self.detector.best(innovation, answer).z2)
 
     def search(
         self, innovation: Innovation, before: ScoredAnswer | None = None, outlined: Priors | None = None
@@ -413,20 +363,20 @@ class Hypotheses:
         evidence decide. outlined: the touches of that answer, free to be no discs; None: as it has them.
         """
         found, discs = list[ScoredAnswer](), _unsearched(innovation) if before is None else before
-        priors = started_from(discs.fit) if outlined is None else list(outlined)
+        priors = started(discs.fit) if outlined is None else list(outlined)
         while (new := self._next_disc(innovation, discs)) is not None:
             priors, association = [*priors, new], (*discs.association, -1)
             # The next parts tell one outline from two discs.
-            if discs.fit is None and innovation.part and new.since_s > 0:
-                found.append(self.fitted(innovation, priors, association, n.STEPS_COLD))
+            if discs.fit is None and innovation.scan.part and new.since_s > 0:
+                found.append(self.fitted(innovation, priors, association))
                 if found[0].explained:
                     break
-            more = self.fitted(innovation, [*started_from(discs.fit), plain(new)], association, n.STEPS_COLD)
+            more = self.fitted(innovation, [*started(discs.fit), plain(new)], association)
             if more.score < discs.score + innovation.least_gain:
                 break
             discs = more
             found += self._outlined(innovation, priors, discs)
-            if discs.explained and not innovation.by_evidence:
+            if discs.explained and not innovation.whole:
                 break
         return found
 
@@ -434,34 +384,28 @@ class Hypotheses:
         """The likeliest one in what others leave; None where it would not be seen, or may not be looked for."""
         if discs.count >= n.MOST_TOUCHES or innovation.spent:
             return None
-        z2, disc, action, since_s = self.detector.best(
-            innovation, discs.weighted_residual, discs.white, discs.fit, innovation.onsets
-        )
-        if z2 < innovation.least_z2:
+        found = self.detector.best(innovation, discs, innovation.onsets)
+        if found.z2 < innovation.least_z2:
             return None
-        x, y = self.grid.discs[disc, PLACE]
-        return replace(anywhere(x, y, action, innovation.span_s), since_s=since_s)
+        x, y = self.grid.discs[found.disc, PLACE]
+        return replace(anywhere(x, y, found.action, innovation.span_s), since_s=found.since_s)
 
     def _outlined(self, innovation: Innovation, priors: Priors, discs: ScoredAnswer) -> list[ScoredAnswer]:
-        """Touches that were found as discs with outlines of their own. By evidence each may be a disc, or odder than
-        outlines go.
-        """
+        """Touches that were found as discs, with their own outlines. In a whole scan each may be a disc, or odder."""
         association = discs.association
-        outlined = self.fitted(innovation, started(priors, discs.fit), association, n.STEPS_COLD)
+        outlined = self.fitted(innovation, started(discs.fit, priors), association)
         assert outlined.fit is not None
-        found = [outlined]
-        if innovation.by_evidence:
-            found[0] = replace(outlined, score=max(outlined.score, discs.score))
-        found += self._wide(innovation, outlined)
+        best = max(outlined.score, discs.score) if innovation.whole else outlined.score
+        found = [replace(outlined, score=best), *self._wide(innovation, outlined)]
         if (pair := neighbours(outlined.fit.states, association)) is not None:
             found += self.merged(innovation, outlined, *pair)
         return found
 
     def _wide(self, innovation: Innovation, answer: ScoredAnswer) -> list[ScoredAnswer]:
         """The same touches by a response that is wrong by more, where that is asked and theirs leaves something."""
-        if not innovation.by_evidence or answer.chi2 <= n.GOOD:
+        if not innovation.whole or answer.chi2 <= n.GOOD:
             return []
-        return [self.fitted(innovation, started_from(answer.fit), answer.association, n.STEPS_COLD, wide=True)]
+        return [self.fitted(innovation, started(answer.fit), answer.association, wide=True)]
 
     def merged(self, innovation: Innovation, answer: ScoredAnswer, a: int, b: int) -> list[ScoredAnswer]:
         """One outlined touch for two discs."""
@@ -471,31 +415,29 @@ class Hypotheses:
         x, y = acts @ states[[a, b], PLACE] / acts.sum()
         one = anywhere(float(x), float(y), float(acts.sum()), innovation.span_s)
         one.start[LOG_RADIUS] = 0.5 * np.logaddexp(2 * states[a, LOG_RADIUS], 2 * states[b, LOG_RADIUS])
-        priors = started_from(answer.fit)
+        priors = started(answer.fit)
         priors[a] = replace(one, since_s=min(priors[a].since_s, priors[b].since_s))
         del priors[b]
         association = tuple(place for k, place in enumerate(answer.association) if k != b)
-        one_less = self.fitted(innovation, priors, association, n.STEPS_COLD)
+        one_less = self.fitted(innovation, priors, association)
         return [one_less, *self._wide(innovation, one_less)]
 
-    def _begun_otherwise(self, innovation: Innovation, standing: Priors) -> list[TouchPrior] | None:
+    def _begun_otherwise(self, innovation: Innovation, tracked: Priors) -> list[TouchPrior] | None:
         """A touch that began within these values did so at another instant than the first of them told; None where
         none did. The instant is the likeliest, whatever the action.
         """
         first_s = -0.5 * innovation.span_s
-        young = [k for k, prior in enumerate(standing) if prior.since_s > first_s and prior.until_s == np.inf]
+        young = [k for k, prior in enumerate(tracked) if prior.since_s > first_s and prior.until_s == np.inf]
         if not young:
             return None
         course = TouchCourse(self.response, innovation.times_s, innovation.span_s)
-        priors = list(standing)
-        instants = innovation.instants
+        priors, instants = list(tracked), innovation.instants
         for k in young:
-            everyone = np.stack([prior.start for prior in priors])
             lasting = replace(priors[k], since_s=-np.inf)
             steady = lasting.start.copy()
             steady[RATE:] = 0.0
             others = [prior for other, prior in enumerate(priors) if other != k]
-            beside = course.columns(np.delete(everyone, k, axis=0), others).mean if others else 0.0
+            beside = course.columns(np.stack([prior.start for prior in others]), others).mean if others else 0.0
             own = course.columns(steady[None], [lasting]).mean
             columns = own[:, None] * (innovation.times_s[:, None] >= instants)
             seen = innovation.white(np.where(innovation.live, np.expm1(innovation.y) - beside, 0.0))
@@ -505,12 +447,12 @@ class Hypotheses:
             priors[k] = replace(priors[k], since_s=float(instants[at]))
         return priors
 
-    def _turned(self, innovation: Innovation, standing: Priors, turn: AChange | None) -> list[ScoredAnswer]:
+    def _turned(self, innovation: Innovation, tracked: Priors, turn: StrengthStep | None) -> list[ScoredAnswer]:
         """How strongly they act changed at once: one of them in mid-scan, or any at its end, as they go or are pressed
         harder.
         """
-        priors = list(standing)
-        for k, prior in enumerate(standing):
+        priors = list(tracked)
+        for k, prior in enumerate(tracked):
             # Until then it acts as it did, since a scan before this one: else two that begin would look like one.
             if prior.until_s < np.inf or prior.since_s >= -1.5 * innovation.span_s:
                 continue
@@ -518,18 +460,18 @@ class Hypotheses:
                 steady = acting_steadily(prior, float(prior.start[ACTION]), innovation.span_s)
                 priors[k] = replace(steady, turns_s=_turns_s(innovation))
             elif turn.touch == k:
-                most = max(1.0, turn.left) * float(prior.start[ACTION])
+                most = max(1.0, turn.share) * float(prior.start[ACTION])
                 steady = acting_steadily(prior, most, innovation.span_s)
-                priors[k] = replace(steady, turns_s=turn.at_s, grows=turn.left > 1)
-        if all(now is before for now, before in zip(priors, standing, strict=True)):
+                priors[k] = replace(steady, turns_s=turn.at_s, grows=turn.share > 1)
+        if all(now is before for now, before in zip(priors, tracked, strict=True)):
             return []
-        return [self.fitted(innovation, priors, tuple(range(len(priors))), n.STEPS_COLD)]
+        return [self.fitted(innovation, priors)]
 
-    def _released(self, innovation: Innovation, standing: Priors, end: AChange | None) -> list[ScoredAnswer]:
+    def _released(self, innovation: Innovation, tracked: Priors, end: StrengthStep | None) -> list[ScoredAnswer]:
         """One of the touches ended at once within the scan, or before it; empty where none did."""
         if end is None:
             return []
-        priors, association = list(standing), list(range(len(standing)))
+        priors, association = list(tracked), list(range(len(tracked)))
         if end.at_s > -np.inf:
             went = priors[end.touch]
             if end.at_s < np.inf:
@@ -537,50 +479,48 @@ class Hypotheses:
             priors[end.touch] = replace(went, until_s=end.at_s)
         else:
             del priors[end.touch], association[end.touch]
-        if priors:
-            return [self.fitted(innovation, priors, tuple(association), n.STEPS_COLD)]
-        return [self.untouched(innovation)]
+        return [self.fitted(innovation, priors, tuple(association)) if priors else self.untouched(innovation)]
 
     def _changes(
-        self, innovation: Innovation, standing: Priors, answer: ScoredAnswer
-    ) -> tuple[AChange | None, AChange | None]:
+        self, innovation: Innovation, tracked: Priors, answer: ScoredAnswer
+    ) -> tuple[StrengthStep | None, StrengthStep | None]:
         """The end of one of the touches that leaves least of a scan, and the other change of one that leaves less than
         half as much; None where none leaves half of what they leave as they are. One that has ended did so at another
         instant than the first values after it told, or not at all.
         """
         course = TouchCourse(self.response, innovation.times_s, innovation.span_s)
-        each = [course.columns(prior.start[None], [prior]).mean for prior in standing]
-        whole = np.sum(each, axis=0)
+        each = [course.columns(prior.start[None], [prior]).mean for prior in tracked]
+        total = np.sum(each, axis=0)
         end, turn = None, None
-        least = turned = 0.5 * self._unlike(innovation, answer, whole[:, None])[0]
-        for k, prior in enumerate(standing):
-            for tried in _releases(course, innovation, prior, each[k], whole - each[k]):
-                chi2 = self._unlike(innovation, answer, tried.beside[:, None] + tried.missing)
+        least = turned = 0.5 * self._unlike(innovation, answer, total[:, None])[0]
+        for k, prior in enumerate(tracked):
+            for at_s, before, missing in _releases(course, innovation, prior, each[k], total - each[k]):
+                chi2 = self._unlike(innovation, answer, before[:, None] + missing)
                 at = int(chi2.argmin())
                 if chi2[at] < least:
-                    end, least = AChange(k, tried.instant(at), 0.0), float(chi2[at])
+                    end, least = StrengthStep(k, float(at_s[at]), 0.0), float(chi2[at])
                 if prior.until_s < np.inf:
                     continue
-                share = self._share(innovation, answer, tried.beside, tried.missing)
-                chi2 = self._unlike(innovation, answer, tried.beside[:, None] + share * tried.missing)
+                share = self._share(innovation, answer, before, missing)
+                chi2 = self._unlike(innovation, answer, before[:, None] + share * missing)
                 at = int(chi2.argmin())
                 if chi2[at] < min(turned, 0.5 * least, 0.5 * chi2[0]):  # by more than one that changed before the scan
-                    turn, turned = AChange(k, float(tried.ends_s[at]), 1 - float(share[at])), float(chi2[at])
+                    turn, turned = StrengthStep(k, float(at_s[at]), 1 - float(share[at])), float(chi2[at])
         return end, turn if turned < 0.5 * least or end is None else None
 
-    def _share(self, innovation: Innovation, answer: ScoredAnswer, change: Array, gone: Array) -> Array:
-        """(n,) of what would go (K, n) beside a change (K,), by which the residual is least."""
+    def _share(self, innovation: Innovation, answer: ScoredAnswer, change: Array, missing: Array) -> Array:
+        """(n,) of what may be missing (K, n) of a change (K,), with which the residual is least."""
         change = np.maximum(change, LEAST_MEAN)
         counts = np.where(innovation.live, 1 / (1 + change), 0.0)
-        left = answer.white(np.where(innovation.live, innovation.y - np.log1p(change), 0.0))
-        columns = answer.white(gone * counts[:, None])
-        return np.asarray((left @ columns) / np.maximum(np.sum(columns**2, axis=0), 1e-12))
+        residual = answer.white(np.where(innovation.live, innovation.y - np.log1p(change), 0.0))
+        columns = answer.white(missing * counts[:, None])
+        return np.asarray((residual @ columns) / np.maximum(np.sum(columns**2, axis=0), 1e-12))
 
     def _unlike(self, innovation: Innovation, answer: ScoredAnswer, changes: Array) -> Array:
         """(n,) squared sigmas of what changes (K, n) leave of a scan, by the covariance of an answer."""
-        left = np.where(innovation.live, innovation.y, 0.0)[:, None] - np.log1p(np.maximum(changes, LEAST_MEAN))
-        left[~innovation.live] = 0.0
-        return np.asarray(np.sum(answer.white(left) ** 2, axis=0))
+        residual = np.where(innovation.live, innovation.y, 0.0)[:, None] - np.log1p(np.maximum(changes, LEAST_MEAN))
+        residual[~innovation.live] = 0.0
+        return np.asarray(np.sum(answer.white(residual) ** 2, axis=0))
 
 
 def _unsearched(innovation: Innovation) -> ScoredAnswer:

@@ -47,24 +47,63 @@ class StepBudget:
 
 
 @dataclass(frozen=True)
-class Innovation:
+class Observation:
+    """One scan as it was observed: log |Z|, which measurements count, and when each was taken."""
+
+    scan: Scan
+    log_z: Array  # (K,) 0 where a measurement does not count
+    live: NDArray[np.bool_]  # (K,)
+    whole: bool  # it shares no value with the last one that was whole
+    budget: StepBudget
+
+    @property
+    def fields(self) -> tuple[Scan, Array, NDArray[np.bool_], bool, StepBudget]:
+        """What makes an observation, and the first of what makes more of it."""
+        return self.scan, self.log_z, self.live, self.whole, self.budget
+
+    @property
+    def span_s(self) -> float:
+        return self.scan.duration_s
+
+    @property
+    def middle_s(self) -> float:
+        return self.scan.at_ns * 1e-9 - self.scan.duration_s / 2
+
+    @property
+    def oldest_s(self) -> float:
+        return self.middle_s - self.span_s / 2
+
+    @property
+    def end_s(self) -> float:
+        return self.middle_s + self.span_s / 2
+
+    @property
+    def sample_s(self) -> float:
+        """For when what touches is estimated, from the middle of the scan on."""
+        return self.scan.sample_ns * 1e-9 - self.middle_s
+
+    @property
+    def times_s(self) -> Array:
+        """(K,) from the middle of the scan."""
+        return self.span_s / 2 - self.scan.ages_s
+
+    @cached_property
+    def order(self) -> NDArray[np.intp]:
+        """(K,) rank in time, 0 the oldest."""
+        return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
+
+
+@dataclass(frozen=True)
+class Innovation(Observation):
     """The innovation of one scan: y over the prediction without touches, its covariance S, and what is known of the
     touches that there may be; with the steps that hypotheses about it may cost.
     """
 
     y: Array  # (K,) log |Z| over the prediction; 0 where a measurement does not count
     covariance: Array  # (K, K)
-    live: NDArray[np.bool_]
-    times_s: Array  # (K,) from the middle of the scan
-    span_s: float
-    sample_s: float  # for when what touches is said, from the middle of the scan on
-    order: NDArray[np.intp]  # (K,) rank in time, 0 the oldest
-    part: int  # that it ends with
     information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
-    budget: StepBudget
-    candidates: tuple[TouchPrior, ...]  # touches that nearly explained the scan before, or this one
-    places: tuple[int, ...]  # of each the standing one that it continues; -1: it is new
-    by_evidence: bool = False  # how many touch is decided by evidence alone: of a whole scan; a part leaves more open
+    candidates: tuple[TouchPrior, ...] = ()  # touches that nearly explained the scan before, or this one
+    places: tuple[int, ...] = ()  # of each the tracked one that it continues; -1: it is new
     keeps: float = 0.0  # steps that are left to who asks next
 
     @property
@@ -73,18 +112,20 @@ class Innovation:
 
     @property
     def touch_log_prior(self) -> float:
-        """Of a touch that begins [nat]."""
-        return n.LOG_PRIOR_TOUCH + (n.WIDE_START if self.by_evidence else 0.0)
+        """Of a touch that begins [nat]. How many touch is decided by evidence alone in a whole scan: a part leaves more
+        open.
+        """
+        return n.LOG_PRIOR_TOUCH + (n.WIDE_START if self.whole else 0.0)
 
     @property
     def least_z2(self) -> float:
         """z^2 of a further disc that is tried."""
-        return float(n.ANOTHER_Z2 if self.by_evidence else n.FALSE_ALARM_Z2)
+        return float(n.ANOTHER_Z2 if self.whole else n.FALSE_ALARM_Z2)
 
     @property
     def least_gain(self) -> float:
         """Evidence that a further touch must add [nat]."""
-        return 0.0 if self.by_evidence else float(n.ANOTHER)
+        return 0.0 if self.whole else float(n.ANOTHER)
 
     @cached_property
     def instants(self) -> Array:
@@ -118,7 +159,7 @@ class ScoredAnswer:
     score: float  # log evidence and prior
     white: Whitening
     weighted_residual: Array  # (K,) S^-1 of the residual
-    left: Array  # (K,)
+    residual: Array  # (K,)
     recounted: bool = False  # its touches are others than those that stood
     near: bool = False  # a new touch lies on another one: such two are one
     wide: bool = False  # by a response that is wrong by more than it should be
@@ -150,18 +191,19 @@ class ScoredAnswer:
         """Of what else may add to the scan by this column (K,): 1 / variance of its size."""
         return float(np.sum(self.white(column) ** 2)) if self.fit is None else self.fit.information(column)
 
+    def informations(self, columns: Array) -> Array:
+        """(n,) of each of these columns (K, n) alone."""
+        return (
+            np.asarray(np.sum(self.white(columns) ** 2, axis=0)) if self.fit is None else self.fit.informations(columns)
+        )
 
-def started_from(fit: FoundTouches | None) -> list[TouchPrior]:
-    """The priors of a fit, to be searched from where it ended."""
+
+def started(fit: FoundTouches | None, priors: Priors | None = None) -> list[TouchPrior]:
+    """The touches of a fit, to be searched from where it ended. priors: other ones for them than the fit's."""
     if fit is None:
         return []
-    return [replace(prior, start=state.copy()) for prior, state in zip(fit.priors, fit.states, strict=True)]
-
-
-def started(priors: Sequence[TouchPrior], fit: FoundTouches | None) -> list[TouchPrior]:
-    """The same priors, searched from where a fit ended."""
-    states = fit.states if fit is not None else [prior.start for prior in priors]
-    return [replace(prior, start=state.copy()) for prior, state in zip(priors, states, strict=True)]
+    priors = fit.priors if priors is None else priors
+    return [replace(prior, start=state.copy()) for prior, state in zip(priors, fit.states, strict=True)]
 
 
 def begun_at(state: Array, span_s: float, since_s: float = -np.inf, until_s: float = np.inf) -> TouchPrior:
@@ -178,78 +220,10 @@ def begun_as(fit: FoundTouches, span_s: float) -> tuple[TouchPrior, ...]:
 
 
 def likeliest(answers: Sequence[ScoredAnswer]) -> ScoredAnswer:
-    """Of those that explain the scan, if there are any."""
+    """Of those that explain the scan, if any does."""
     explained = [answer for answer in answers if answer.explained]
-    apart = [answer for answer in answers if not answer.near]
-    return max(explained or apart or answers, key=lambda answer: answer.score)
-
-
-@dataclass(frozen=True)
-class Observation:
-    """One scan as it was observed: log |Z|, which measurements count, and when each was taken."""
-
-    scan: Scan
-    log_z: Array  # (K,) 0 where a measurement does not count
-    live: NDArray[np.bool_]  # (K,)
-    whole: bool  # it shares no value with the last one that was whole
-    budget: StepBudget
-
-    @property
-    def span_s(self) -> float:
-        return self.scan.duration_s
-
-    @property
-    def middle_s(self) -> float:
-        return self.scan.at_ns * 1e-9 - self.scan.duration_s / 2
-
-    @property
-    def oldest_s(self) -> float:
-        return self.middle_s - self.span_s / 2
-
-    @property
-    def end_s(self) -> float:
-        return self.middle_s + self.span_s / 2
-
-    @property
-    def sample_s(self) -> float:
-        """For when what touches is said, from the middle of the scan on."""
-        return self.scan.sample_ns * 1e-9 - self.middle_s
-
-    @property
-    def times_s(self) -> Array:
-        """(K,) from the middle of the scan."""
-        return self.span_s / 2 - self.scan.ages_s
-
-    @cached_property
-    def order(self) -> NDArray[np.intp]:
-        """(K,) rank in time, 0 the oldest."""
-        return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
-
-    def innovation(
-        self,
-        y: Array,
-        covariance: Array,
-        live: NDArray[np.bool_],
-        information: NDArray[np.float32],
-        candidates: tuple[TouchPrior, ...],
-        places: tuple[int, ...] = (),
-    ) -> Innovation:
-        """About this scan."""
-        return Innovation(
-            y=y,
-            covariance=covariance,
-            live=live,
-            times_s=self.times_s,
-            span_s=self.span_s,
-            sample_s=self.sample_s,
-            order=self.order,
-            part=self.scan.part,
-            information=information,
-            budget=self.budget,
-            candidates=candidates,
-            places=places,
-            by_evidence=self.whole,
-        )
+    separate = [answer for answer in answers if not answer.near]
+    return max(explained or separate or answers, key=lambda answer: answer.score)
 
 
 @dataclass(frozen=True)

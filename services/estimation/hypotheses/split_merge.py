@@ -23,10 +23,9 @@ from services.estimation.hypotheses.innovation import (
     begun_as,
     likeliest,
     started,
-    started_from,
 )
 from services.estimation.overlap import gaps, neighbours
-from services.estimation.touches import oddness
+from services.estimation.track import oddness
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -51,7 +50,7 @@ class SplitMergeTest:
         ask, new = self._hypotheses, (-1,) * len(fit)
         begun = begun_as(fit, innovation.span_s)
         same = self._same(innovation, answer, begun)
-        discs = ask.fitted(innovation, [plain(prior) for prior in begun], new, n.STEPS_COLD)
+        discs = ask.fitted(innovation, [plain(prior) for prior in begun], new)
         enough = max(each.score for each in (*same, discs)) + self._least_gain
         found = [discs, *ask.search(innovation, discs, begun)]
         assert same[0].fit is not None
@@ -71,11 +70,11 @@ class SplitMergeTest:
     def _same(self, innovation: Innovation, answer: ScoredAnswer, begun: Priors) -> list[ScoredAnswer]:
         """As many touches, as they are and by what else the answer explains its scan with."""
         ask, new = self._hypotheses, (-1,) * len(begun)
-        found = [ask.fitted(innovation, begun, new, n.STEPS_COLD)]
+        found = [ask.fitted(innovation, begun, new)]
         if answer.wide:
-            found.append(ask.fitted(innovation, begun, new, n.STEPS_COLD, wide=True))
+            found.append(ask.fitted(innovation, begun, new, wide=True))
         if answer.cause:
-            found += ask.with_cause(innovation, begun, new, answer.cause, answer.left)
+            found += ask.with_cause(innovation, begun, new, answer.cause, answer.residual)
         return found
 
     def _halved(self, innovation: Innovation, begun: Priors, discs: ScoredAnswer, one: int) -> list[ScoredAnswer]:
@@ -88,13 +87,12 @@ class SplitMergeTest:
         halves = self._halves(innovation, fit, one)
         if not halves:
             return []
-        as_discs, new = started_from(fit), (-1,) * (len(fit) + 1)
-        rest = [k for k in range(len(fit)) if k != one]
-        found = self._hypotheses.fitted(
-            innovation, [*(as_discs[k] for k in rest), *map(plain, halves)], new, 2 * n.STEPS_COLD
-        )
-        outlined = started([*(begun[k] for k in rest), *halves], found.fit)
-        both = found, self._hypotheses.fitted(innovation, outlined, new, n.STEPS_COLD)
+        as_discs, new = started(fit), (-1,) * (len(fit) + 1)
+        others = [k for k in range(len(fit)) if k != one]
+        priors = [*(as_discs[k] for k in others), *map(plain, halves)]
+        found = self._hypotheses.fitted(innovation, priors, new, 2 * n.STEPS_COLD)
+        outlined = started(found.fit, [*(begun[k] for k in others), *halves])
+        both = found, self._hypotheses.fitted(innovation, outlined, new)
         return [other for other in both if other.fit is not None and gaps(other.fit.states).min() > 0]
 
     def _halves(self, innovation: Innovation, fit: FoundTouches, one: int) -> list[TouchPrior]:
@@ -109,9 +107,9 @@ class SplitMergeTest:
             least = float(np.linalg.norm(target - white(np.where(innovation.live, each[one], 0.0))))
         for places, radius in _pairs(fit.states[one]):
             both = np.stack([response(*place, radius) for place in places], axis=1)
-            actions, left = nnls(white(np.where(innovation.live[:, None], both, 0.0)), target)
-            if left < least and actions.min() > 0:
-                least = left
+            actions, residual = nnls(white(np.where(innovation.live[:, None], both, 0.0)), target)
+            if residual < least and actions.min() > 0:
+                least = residual
                 halves = [anywhere(*at, acts, innovation.span_s) for at, acts in zip(places, actions, strict=True)]
         return halves
 
@@ -129,8 +127,7 @@ def _others(fit: FoundTouches | None, than: FoundTouches) -> bool:
     """Whether touches are others than some, or elsewhere."""
     if fit is None or len(fit) != len(than):
         return True
-    for state in fit.states:
-        away = np.hypot(*(than.states[:, PLACE] - state[PLACE]).T).min()
-        if away > max(n.SAME_TOUCH, float(np.exp(state[LOG_RADIUS]))):
-            return True
-    return False
+    return any(
+        np.hypot(*(than.states[:, PLACE] - state[PLACE]).T).min() > max(n.SAME_TOUCH, float(np.exp(state[LOG_RADIUS])))
+        for state in fit.states
+    )
