@@ -49,9 +49,7 @@ class Estimator:
         self.skin: TaredSkin | None = None
 
     def tare(self, force: bool = False) -> AgreedScans:
-        """Take the latest scans for the untouched skin: these. Raises NoBaseline, while something touches unless
-        forced.
-        """
+        """Take the latest scans for the untouched skin: these. Raises NoBaseline; force: not because of touches."""
         if not force and self.wire is not None:
             raise NoBaseline("wires of the board are wrong, expected all as they belong: mend them and try again")
         tells = BaselineTells.NOTHING
@@ -66,11 +64,6 @@ class Estimator:
         """What is wrong with the board's wires."""
         return self.taring.now.wire if self.skin is None else self.skin.faults.now.wire
 
-    @property
-    def touched(self) -> bool:
-        """Whether something touches, or may."""
-        return self.skin is not None and (len(self.skin.touches) > 0 or self.now.unexplained_s > 0)
-
     def use(self, tables: SkinTables) -> None:
         """Of the same skin from the next scan on, as a calibration of its mounting knows it; while nothing touches."""
         self._tables = tables
@@ -84,9 +77,7 @@ class Estimator:
             self.skin.touches.now.watched = True
 
     def adopt(self, baseline: KnownBaseline, age_s: float, contact_per_s: float = n.CONTACT_RATE) -> None:
-        """Go on from a baseline that is age_s older than the next scan; nobody watched meanwhile. contact_per_s: by
-        which contact impedances of this skin change.
-        """
+        """Go on from a baseline age_s older than the next scan. contact_per_s: by which contact impedances change."""
         age_s = min(max(age_s, 0.0), float(n.OLDEST_S))
         self._new_skin(baseline).adopt(contact_per_s, age_s)
         self.now = EstimatorState(adopted_age_s=age_s)
@@ -141,9 +132,7 @@ class Estimator:
     # --- one scan ---
 
     def learn(self) -> None:
-        """What scans before the next one teach: at the latest that asks for it, so who calls it while nothing waits is
-        answered sooner, and the same.
-        """
+        """What scans so far teach, before `step` would: who calls it in a pause is answered sooner, and the same."""
         if self.skin is not None:
             self.skin.learning.catch_up()
 

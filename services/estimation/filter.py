@@ -6,7 +6,6 @@ touches, and each measurement's own remainder. A Kalman filter of log |Z|; touch
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -94,27 +93,19 @@ class SkinFilter:
         which nobody will have watched when it is used. What warms or dries unevenly evens out meanwhile: its rate is a
         mean over that time (Ornstein and Uhlenbeck).
         """
-        k = self._tables.measurements
         ages = max(age_s / float(n.SLOPE_LASTS_S), 1e-6)
         lasting = float(np.sqrt(2 * (ages + np.expm1(-ages))) / ages)
         rates = _by_degree(n.FIELD_RATE, n.SLOPE_RATE * lasting)
         variance = np.concatenate([np.full(MODES, n.FIELD_START**2), rates, contact_variance])
-        start = np.full(k, n.REMAINDER_START**2)
-        self.now = FilterState(at_s, np.zeros(self._fixed), np.diag(variance), np.zeros(k), start)
+        remainder = np.zeros(self._tables.measurements)
+        start = remainder + n.REMAINDER_START**2
+        self.now = FilterState(at_s, np.zeros(self._fixed), np.diag(variance), remainder, start)
 
     def succeed(self, before: SkinFilter) -> None:
-        """Go on from the filter of other tables of the same skin: what those columns explained otherwise is each
-        measurement's own from now on, so that what is predicted stays.
-        """
+        """Go on from other tables' filter: what they explain otherwise becomes remainder, so predictions stay."""
         self.now = before.now
         then = before.shift(self.now.at_s)
         self.now.remainder = self.now.remainder + then - self.shift(self.now.at_s)
-
-    def as_it_was(self, then: FilterState) -> SkinFilter:
-        """Of the same skin."""
-        seen = copy(self)
-        seen.now = then
-        return seen
 
     def predict(self, at_s: float, flicker: Array) -> Prediction:
         """flicker (E,): variances of the contact impedances' noise, of which a share is slow."""
@@ -161,9 +152,7 @@ class SkinFilter:
         p[contacts, contacts] += n.FASTER_STAYS * (times - 1) * n.CONTACT_FASTER**2
 
     def update(self, predicted: Prediction, y: Array, white: Whitening) -> Array:
-        """Learn from an untouched frame: y (K,) log |Z| over the prediction, white: of its covariance. Returns
-        S^-1 y (K,).
-        """
+        """Learn from an untouched frame: y (K,) over the prediction, white: of its covariance. Returns S^-1 y (K,)."""
         weighted_residual, gathered = white.solve(y), white(predicted.cross_covariance.T)
         posterior = predicted.p - gathered.T @ gathered
         self._learn(predicted, weighted_residual, posterior, white.conditional_precisions())

@@ -1,10 +1,8 @@
-"""Looks at a scan that cost little, by what was known a moment ago: whether all goes on, and whether a touch came so
-slowly that the filter took it for drift.
-"""
+"""Gates of a scan that cost little, by whitenings of a moment ago, and whether a touch came as slowly as drift."""
 
 from __future__ import annotations
 
-from copy import deepcopy
+from copy import copy, deepcopy
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -23,35 +21,26 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Newest:
-    """The newest block of a scan's measurements."""
-
-    rows: NDArray[np.intp]  # (b,)
-    energy: Array  # (b, b) inverse of their precision: what their energy is taken by
-
-
-@dataclass(frozen=True)
 class Glance:
     """Of scans that are disturbed alike, while nothing touches."""
 
     at_s: float
     white: Whitening
     common_mode_variance: float  # of what all values share, by the filter
-    newest: dict[int, Newest] = field(default_factory=dict)  # by the part measured last
+    newest: dict[int, tuple[NDArray[np.intp], Array]] = field(default_factory=dict)  # by the part measured last
 
     @cached_property
     def common_information(self) -> float:
         """Information of what all values have in common."""
         return float(np.sum(self.white.w.sum(axis=1) ** 2))
 
-    def newest_of(self, part: int, ages_s: Array) -> Newest:
-        """ages_s (K,): of a scan that ends with this part."""
-        known = self.newest.get(part)
-        if known is None:
+    def newest_of(self, part: int, ages_s: Array) -> tuple[NDArray[np.intp], Array]:
+        """(b,) rows of the newest block, (b, b) inverse of their precision. ages_s (K,): of scans with this part."""
+        if part not in self.newest:
             rows = np.argpartition(ages_s, BURST_BLOCK)[:BURST_BLOCK]
             own = self.white.w[:, rows]
-            known = self.newest[part] = Newest(rows, np.asarray(np.linalg.inv(own.T @ own), float))
-        return known
+            self.newest[part] = rows, np.asarray(np.linalg.inv(own.T @ own), float)
+        return self.newest[part]
 
 
 @dataclass(frozen=True)
@@ -76,9 +65,8 @@ class Seen:
 
 
 class NullGate:
-    """Gates of one skin: whether a scan is what noise alone makes of the prediction, by chi^2, the strongest disc and
-    the newest values. It keeps whitenings for all parts that are disturbed alike, by NoiseModel.alike; nothing that a
-    replay would miss.
+    """Whether a scan is what noise alone makes of the prediction, by chi^2, the strongest disc and the newest values.
+    Whitenings are of scans that are disturbed alike (NoiseModel.alike); it keeps nothing that a replay would miss.
     """
 
     def __init__(self, grid: DiscGrid, noise: NoiseModel, drift: SkinFilter) -> None:
@@ -106,9 +94,7 @@ class NullGate:
         return found if found is not None and found.ids == ids and _lately(found.at_s, measured) else None
 
     def look(self, measured: Observation, y: Array, information: NDArray[np.float32]) -> Seen | None:
-        """y (K,): log |Z| over the prediction, 0 where it does not count. None: nothing is known of such scans, or the
-        filter has become so much surer since that it would overlook a step of the gain.
-        """
+        """y (K,): over the prediction, or 0. None: no whitening, or one that would overlook a step of the gain."""
         known = self._glances.get(self._noise.alike(measured.scan.part))
         if known is None or not _lately(known.at_s, measured):
             return None
@@ -117,9 +103,9 @@ class NullGate:
         residual = known.white(y)
         weighted_residual = known.white.w.T @ residual
         chi2 = float(residual @ residual) / max(int(np.count_nonzero(y)), 1)
-        newest = known.newest_of(measured.scan.part, measured.scan.ages_s)
-        own = weighted_residual[newest.rows]
-        fresh = float(own @ newest.energy @ own) - len(own)
+        rows, energy = known.newest_of(measured.scan.part, measured.scan.ages_s)
+        own = weighted_residual[rows]
+        fresh = float(own @ energy @ own) - len(own)
         z2 = max(self._grid.likeliest(weighted_residual, information)[0], fresh)
         even = float(weighted_residual.sum()) ** 2 / known.common_information < n.GAIN_Z2
         return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, z2, weighted_residual, y)
@@ -163,4 +149,6 @@ class SlowOnsetTest:
         if not now.kept or at_s - now.kept[0].at_s < n.SLOW_S or 0 <= at_s - now.looked_s < n.SLOW_EVERY_S:
             return None
         now.looked_s = at_s
-        return self._drift.as_it_was(now.kept[0])
+        then = copy(self._drift)
+        then.now = now.kept[0]
+        return then

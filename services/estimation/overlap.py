@@ -77,17 +77,15 @@ def gaps(states: Sequence[Array] | Array) -> Array:
     return np.asarray(found)
 
 
-def neighbours(states: Array, kept: Sequence[int]) -> tuple[int, int] | None:
-    """Two touches (T, 7), at most one of which there was before, whose edges are near each other; the new one last.
-    kept: of each the one that it was; -1: none.
-    """
+def neighbours(states: Array, association: Sequence[int]) -> tuple[int, int] | None:
+    """Two touches (T, 7) near each other, the new one last. association: of each its track; -1: it is new."""
     for a, b in zip(*np.nonzero(np.triu(gaps(states) < n.NEIGHBOURS)), strict=True):
-        if kept[a] < 0 or kept[b] < 0:
-            return (int(a), int(b)) if kept[b] < 0 else (int(b), int(a))
+        if association[a] < 0 or association[b] < 0:
+            return (int(a), int(b)) if association[b] < 0 else (int(b), int(a))
     return None
 
 
-def apart(states: Array, kept: Sequence[int]) -> bool:
+def apart(states: Array, association: Sequence[int]) -> bool:
     """Whether no touch that is new lies on another one: such two are one, as nobody saw them apart."""
-    new = np.array(kept) < 0
+    new = np.array(association) < 0
     return bool((gaps(states)[new] > n.NEIGHBOURS).all())

@@ -55,46 +55,41 @@ class EstimatorState:
     trusted: KnownBaseline | None = None  # too old to go on from: it tells what touches the first scans
 
 
+@dataclass
 class ScanStep:
     """One scan against a skin as it is known, which it changes."""
 
-    def __init__(
-        self,
-        now: EstimatorState,
-        taring: Taring,
-        skin: TaredSkin,
-        measured: Observation,
-        judgements: list[Judgement],
-    ) -> None:
-        """judgements: those of the scan so far."""
-        self._now, self._taring, self._skin, self._measured = now, taring, skin, measured
-        self._judgements = judgements
+    now: EstimatorState
+    taring: Taring
+    skin: TaredSkin
+    measured: Observation
+    judgements: list[Judgement]  # of the scan so far
 
     def estimate(self, gap_s: float) -> Estimate:
         """What touches. gap_s: since the scan before."""
         self._bridge(gap_s)
-        if (slowly := self._came_slowly()) is not None:
-            return self._conclude(*slowly)
-        seen, noticed, self._now.noticed = self._glance(), self._now.noticed, False
+        if (slow := self._slow_onset()) is not None:
+            return self._conclude(*slow)
+        seen, noticed, self.now.noticed = self._glance(), self.now.noticed, False
         if seen is not None and seen.quiet:
             return self._quiet(seen)
-        if seen is not None and not (noticed or self._measured.whole):
+        if seen is not None and not (noticed or self.measured.whole):
             # Something begins. Its first few values tell no place that could be shown, and asking what they are takes
             # longer than the next part, which tells: it is asked about.
-            self._now.noticed = True
+            self.now.noticed = True
             return self._estimate(seen.y, np.zeros(len(seen.y)), seen.z2, 1.0)
         if (goes_on := self._going_on()) is not None:
             return self._conclude(*goes_on)
-        return self._asked(max(gap_s, 0.0))
+        return self._test_hypotheses(max(gap_s, 0.0))
 
     def _bridge(self, gap_s: float) -> None:
         """The time since the scan before: that a baseline was kept, or that scans were lost."""
-        skin, measured = self._skin, self._measured
-        if self._now.adopted_age_s is not None:
+        skin, measured = self.skin, self.measured
+        if self.now.adopted_age_s is not None:
             for state in skin.aged:
                 state.at_s += measured.middle_s
             skin.drift.now = skin.aged[-1]
-            self._now.adopted_age_s = None
+            self.now.adopted_age_s = None
         skin.noise.lines.ordered(measured.scan.part, measured.order)
         if not 0 <= gap_s <= n.GAP_S:
             skin.touches.lose()
@@ -104,17 +99,17 @@ class ScanStep:
     @property
     def _complete(self) -> bool:
         """Whether every measurement that the baseline has counts."""
-        return bool((self._measured.live == self._skin.live).all())
+        return bool((self.measured.live == self.skin.live).all())
 
     @property
     def _plain(self) -> bool:
         """Whether nothing is wrong with the board either."""
-        return self._complete and self._skin.faults.plain(self._measured.oldest_s)
+        return self._complete and self.skin.faults.plain(self.measured.oldest_s)
 
     @property
     def _y(self) -> Array:
         """(K,) log |Z| over what the filter predicts of the untouched skin on this board; 0 where it does not count."""
-        skin, measured = self._skin, self._measured
+        skin, measured = self.skin, self.measured
         over = measured.log_z - skin.log_z0 - skin.drift.shift(measured.middle_s)
         return np.where(measured.live, skin.faults.taken_off(over), 0.0)
 
@@ -122,17 +117,17 @@ class ScanStep:
 
     def _glance(self) -> Seen | None:
         """What a first look sees where nothing touched before; None where it cannot tell."""
-        skin, measured, known = self._skin, self._measured, self._skin.grid_information
+        skin, measured, known = self.skin, self.measured, self.skin.grid_information
         if known is None or len(skin.touches) or not self._plain:
             return None
         if measured.whole and skin.drift.remembers(measured.middle_s):
             return None
         return skin.null_gate.look(measured, self._y, known.each)
 
-    def _came_slowly(self) -> tuple[Innovation, ScoredAnswer] | None:
+    def _slow_onset(self) -> tuple[Innovation, ScoredAnswer] | None:
         """A touch where nothing touched, that no drift since a while ago explains: the filter is that of then."""
-        skin, measured, middle_s = self._skin, self._measured, self._measured.middle_s
-        if len(skin.touches) or self._now.unexplained_s or not (measured.whole and skin.tables.predicted):
+        skin, measured, middle_s = self.skin, self.measured, self.measured.middle_s
+        if len(skin.touches) or self.now.unexplained_s or not (measured.whole and skin.tables.predicted):
             return None
         if not self._plain or (then := skin.slow_onset.due(middle_s)) is None:
             return None
@@ -153,8 +148,8 @@ class ScanStep:
 
     def _going_on(self) -> tuple[Innovation, ScoredAnswer] | None:
         """That touches which stayed as they are do so in a further part of a scan; else None."""
-        skin, measured, information = self._skin, self._measured, self._skin.grid_information
-        if measured.whole or information is None or not skin.touches.steady or self._now.unexplained_s:
+        skin, measured, information = self.skin, self.measured, self.skin.grid_information
+        if measured.whole or information is None or not skin.touches.steady or self.now.unexplained_s:
             return None
         if not self._plain or (known := skin.null_gate.steady(measured, skin.touches.ids)) is None:
             return None
@@ -168,52 +163,53 @@ class ScanStep:
     # --- answers ---
 
     def _quiet(self, seen: Seen) -> Estimate:
-        skin, measured = self._skin, self._measured
+        skin, measured = self.skin, self.measured
         self._explained(AS_IT_IS)
         skin.remember(skin.refused.explained(measured.oldest_s))
         if measured.whole:
             log_z = skin.log_z0 + skin.faults.taken_off(measured.log_z - skin.log_z0)
-            self._measured = replace(measured, log_z=log_z)
+            self.measured = replace(measured, log_z=log_z)
         self._learn_untouched(seen.weighted_residual, AS_IT_IS)
-        self._now.published, self._now.candidates = (), []
+        self.now.published, self.now.candidates = (), []
         return self._estimate(seen.y, np.zeros(len(seen.y)), seen.z2, 0.0)
 
     def _conclude(self, innovation: Innovation, answer: ScoredAnswer) -> Estimate:
-        update_tracks(self._skin, innovation, answer, self._measured, self._now.unexplained_s)
+        update_tracks(self.skin, innovation, answer, self.measured, self.now.unexplained_s)
         self._explained(answer.cause)
         return self._publish(innovation, answer, explained=True)
 
-    def _asked(self, passed_s: float) -> Estimate:
-        skin, now = self._skin, self._now
-        skin.touches.drop_ended(self._measured.oldest_s)
+    def _test_hypotheses(self, passed_s: float) -> Estimate:
+        skin, now = self.skin, self.now
+        skin.touches.drop_ended(self.measured.oldest_s)
         if vague := skin.touches.drop_tentative(skin.faults.in_question):
             now.candidates = [OpenTouch(track.state, track.since_s) for track in vague]
         found = self._explain()
         innovation, answer, view = found.innovation, found.answer, found.view
         # as sound wires would show it
-        self._measured = replace(self._measured, log_z=view.at.untouched + view.y, live=view.live)
+        self.measured = replace(self.measured, log_z=view.at.untouched + view.y, live=view.live)
         if answer.nearly_holds:
-            update_tracks(skin, innovation, answer, self._measured, now.unexplained_s)
+            update_tracks(skin, innovation, answer, self.measured, now.unexplained_s)
         transient = answer.fit is not None and not len(skin.touches)  # it came and went within the scan
         self._update_lock(innovation, answer, transient)
         self._keep_candidates(answer)
         if answer.holds and not found.changed and self._plain:
-            skin.null_gate.keep(self._measured, skin.touches.ids, innovation, answer)
-        skin.faults.follow(view, answer, passed_s, self._measured.whole)
+            skin.null_gate.keep(self.measured, skin.touches.ids, innovation, answer)
+        skin.faults.follow(view, answer, passed_s, self.measured.whole)
         sound = skin.faults.sound
         skin.isolation.decide(found)
         if sound:
             self._learn(found)
         if sound and answer.fit is not None:
-            innovation = replace(innovation, y=innovation.y - _drifted(found))
-        self._judgements += self._judged(found)
+            drifted = view.grown * (view.at.predicted.covariance @ (view.grown * answer.weighted_residual))
+            innovation = replace(innovation, y=innovation.y - np.where(view.live, drifted, 0.0))
+        self.judgements += self._judged(found)
         return self._publish(innovation, answer, answer.holds and not transient)
 
     def _explain(self) -> Explanation:
         """What explains a scan, with all that the skin may remember."""
-        skin, steps = self._skin, self._skin.faults.now.gain_steps
+        skin, steps = self.skin, self.skin.faults.now.gain_steps
         found = self._likeliest_age()
-        if found.answer.holds and (pressed := skin.refused.explained(self._measured.oldest_s)):
+        if found.answer.holds and (pressed := skin.refused.explained(self.measured.oldest_s)):
             skin.remember(pressed)
             found = self._explanation()  # again: what is left may be memory
         if skin.faults.now.gain_steps > steps:
@@ -221,10 +217,8 @@ class ScanStep:
         return found
 
     def _likeliest_age(self) -> Explanation:
-        """What explains a scan: the first one after a baseline was adopted tells how far the skin has drifted. In doubt
-        further: who takes drift for a touch is worse off than who is unsure.
-        """
-        skin, budget = self._skin, self._measured.budget
+        """The first scan after adopting tells how far the skin drifted. In doubt further: else drift is a touch."""
+        skin, budget = self.skin, self.measured.budget
         if len(skin.aged) < 2:
             return self._explanation()
         tried, faults, steps = [], skin.faults.now, budget.left
@@ -234,82 +228,86 @@ class ScanStep:
             tried.append((self._explanation(), state, skin.faults.now))
         holding = [each for each in tried if each[0].answer.holds] or tried
         best = max((each[0].answer for each in holding), key=lambda answer: answer.score)
-        nearly = [each for each in holding if _nearly_as_likely(each[0].answer, best)]
+        # An older one may be less likely, the more touches it saves.
+        nearly = [
+            each
+            for each in holding
+            if each[0].answer.score >= best.score - n.YOUNGER * max(1, best.count - each[0].answer.count)
+        ]
         found, skin.drift.now, skin.faults.now = nearly[-1]
         skin.aged = []
         return found
 
     def _explanation(self) -> Explanation:
-        skin, measured = self._skin, self._measured
+        skin, measured = self.skin, self.measured
         predicted = skin.drift.predict(measured.middle_s, skin.noise.now.flicker)
-        selection = HypothesisSelection(skin, measured, predicted, self._now.unexplained_s)
+        selection = HypothesisSelection(skin, measured, predicted, self.now.unexplained_s)
         at = PredictedScan(*measured.fields, predicted, skin.log_z0 + predicted.shift)
         return skin.isolation(at, self._innovation_of, selection.answer, selection.recounted)
 
     def _innovation_of(self, hypotheses: Hypotheses, view: BoardView, covariance: Array) -> Innovation:
-        now, skin, known, wire = self._now, self._skin, self._skin.grid_information, self._skin.faults.now.wire
+        now, skin, known, wire = self.now, self.skin, self.skin.grid_information, self.skin.faults.now.wire
         same = known is not None and np.array_equal(known.live, view.live) and known.wire == wire
         if known is None or not same or now.wholes - known.wholes >= n.LINE_SCANS:
             each = hypotheses.grid.information(Whitening.of(covariance))
             known = skin.grid_information = GridInformation(each, now.wholes, view.live, wire)
-        candidates = tuple(candidate.begun(self._measured) for candidate in now.candidates)
+        candidates = tuple(candidate.begun(self.measured) for candidate in now.candidates)
         ids = skin.touches.ids
         places = tuple(ids.index(each.id) if each.id in ids else -1 for each in now.candidates)
-        fields = replace(self._measured, live=view.live).fields
+        fields = replace(self.measured, live=view.live).fields
         return Innovation(*fields, view.y, covariance, known.each, candidates, places).leaving(n.FOR_FAULTS)
 
     # --- what follows ---
 
     def _update_lock(self, innovation: Innovation, answer: ScoredAnswer, transient: bool) -> None:
         """Whether the skin is still followed: explained, or for how long it has not been."""
-        now, tracks = self._now, self._skin.touches.now.tracks
+        now, tracks = self.now, self.skin.touches.now.tracks
         if transient or not answer.nearly_holds:
-            self._refused(innovation.y)
-            if not answer.nearly_holds and _strange(innovation, answer):
-                now.unexplained_s = max(now.unexplained_s, float(n.CHANGING_S))
+            self._refused(innovation, answer)
         elif answer.fit is None or any(track.confirmed for track in tracks):
             self._explained(answer.cause, roughly=not answer.holds)
-        elif self._measured.whole:  # a touch that comes again and again, and never for sure, is none
-            now.unexplained_s += self._measured.span_s
+        elif self.measured.whole:  # a touch that comes again and again, and never for sure, is none
+            now.unexplained_s += self.measured.span_s
 
     def _keep_candidates(self, answer: ScoredAnswer) -> None:
         """Touches that nearly explain a scan, for the next one."""
         if answer.nearly_holds:
-            self._now.candidates = []
+            self.now.candidates = []
         elif answer.fit is not None:  # else no touch was looked for
-            ids = [self._skin.touches.ids[place] if place >= 0 else 0 for place in answer.association]
+            ids = [self.skin.touches.ids[place] if place >= 0 else 0 for place in answer.association]
             found = zip(answer.fit.states, answer.fit.priors, ids, strict=True)
-            middle_s = self._measured.middle_s
-            self._now.candidates = [OpenTouch(state, middle_s + prior.since_s, id) for state, prior, id in found]
+            middle_s = self.measured.middle_s
+            self.now.candidates = [OpenTouch(state, middle_s + prior.since_s, id) for state, prior, id in found]
 
     def _explained(self, cause: str, roughly: bool = False) -> None:
-        skin, measured = self._skin, self._measured
-        self._now.unexplained_s = 0.0
+        skin, measured = self.skin, self.measured
+        self.now.unexplained_s = 0.0
         skin.touches.now.watched = True
         if not roughly:
             skin.faults.gain_holds(measured.end_s)
         if cause == AS_IT_IS:
             skin.hypotheses.process_noise_scale = 1.0
 
-    def _refused(self, y: Array) -> None:
-        """Nothing explains it: the longer that lasts, the further the skin may have drifted. y (K,): log |Z| over what
-        is predicted of the untouched skin.
-        """
-        skin, span_s = self._skin, self._measured.span_s
+    def _refused(self, innovation: Innovation, answer: ScoredAnswer) -> None:
+        """Nothing explains it: the longer that lasts, the further the skin may have drifted."""
+        now, skin, span_s = self.now, self.skin, self.measured.span_s
         skin.learning.doubt()
-        if not self._measured.whole:
-            return
-        skin.refused.refuse(y, span_s)
-        self._now.unexplained_s += span_s
-        if skin.tables.predicted and self._now.unexplained_s > n.CHANGING_S:
-            skin.hypotheses.process_noise_scale = min(n.MOST_ADRIFT, skin.hypotheses.process_noise_scale * n.ADRIFT)
+        if self.measured.whole:
+            skin.refused.refuse(innovation.y, span_s)
+            now.unexplained_s += span_s
+            if skin.tables.predicted and now.unexplained_s > n.CHANGING_S:
+                scale = skin.hypotheses.process_noise_scale * n.ADRIFT
+                skin.hypotheses.process_noise_scale = min(n.MOST_ADRIFT, scale)
+        unexplained, change = (float(np.sum(answer.white(each) ** 2)) for each in (answer.residual, innovation.y))
+        if not answer.nearly_holds and unexplained > n.STRANGE * change:  # the likeliest touches leave most of it
+            now.unexplained_s = max(now.unexplained_s, float(n.CHANGING_S))
 
     def _learn(self, found: Explanation) -> None:
         """From untouched scans all, while touched what the touches leave open, now and then: what their response gets
         wrong is the same from scan to scan. Nothing where a contact or the gain changes: the rest is off by what its
         size was expected to be.
         """
-        skin, measured, answer, view = self._skin, self._measured, found.answer, found.view
+        skin, measured, answer, view = self.skin, self.measured, found.answer, found.view
         if not answer.holds or found.changed or view.contact >= 0 or skin.faults.gain_gross(measured.end_s):
             return
         if answer.fit is None:
@@ -318,7 +316,7 @@ class ScanStep:
         skin.learning.doubt()
         if not measured.whole:
             return
-        self._now.wholes += 1
+        self.now.wholes += 1
         if answer.cause != AS_IT_IS or not measured.scan.believed:
             return
         skin.noise.learn_contacts(answer.weighted_residual, answer.white)
@@ -330,7 +328,7 @@ class ScanStep:
             skin.null_gate.forget()
 
     def _learn_untouched(self, weighted_residual: Array, cause: str) -> None:
-        skin, measured, scan = self._skin, self._measured, self._measured.scan
+        skin, measured, scan = self.skin, self.measured, self.measured.scan
         if not scan.believed:
             return
         if cause == MEMORY and measured.whole:
@@ -341,7 +339,7 @@ class ScanStep:
             skin.noise.hear(weighted_residual, scan.part, odd, measured.middle_s, measured.span_s)
         if not measured.whole:
             return
-        self._now.wholes += 1
+        self.now.wholes += 1
         if cause not in (AS_IT_IS, DRIFT, MEMORY):
             return
         drifts = skin.hypotheses.process_noise_scale if cause == DRIFT else 0.0
@@ -355,7 +353,7 @@ class ScanStep:
 
     def _judged(self, found: Explanation) -> list[Judgement]:
         """What the board and lost scans leave of a scan's word."""
-        skin, measured, faults, failed = self._skin, self._measured, self._skin.faults, float(found.view.failed.mean())
+        skin, measured, faults, failed = self.skin, self.measured, self.skin.faults, float(found.view.failed.mean())
         return [
             *advice.judgements_of(faults.states(), measured.scan.status, failed, faults.now.doubt.undecided),
             judge("gap", float(skin.touches.lost), 1.0),
@@ -365,9 +363,9 @@ class ScanStep:
         ]
 
     def _publish(self, innovation: Innovation, answer: ScoredAnswer, explained: bool) -> Estimate:
-        skin, touches = self._skin, self._skin.touches
-        self._now.published = self._touches_published(innovation, answer)
-        self._now.published_ns = self._measured.scan.sample_ns
+        skin, touches = self.skin, self.skin.touches
+        self.now.published = self._touches_published(innovation, answer)
+        self.now.published_ns = self.measured.scan.sample_ns
         unsure = not all(track.confirmed for track in touches.now.tracks)
         # Squared sigmas of what the answer leaves, and of the touches that explain the scan, or would.
         z2 = [answer.next_touch_z2 / (max(1.0, answer.chi2) if answer.quiet else 1.0)]
@@ -382,48 +380,29 @@ class ScanStep:
         return self._estimate(innovation.y, np.sqrt(np.diag(innovation.covariance)), max(z2), changing)
 
     def _touches_published(self, innovation: Innovation, answer: ScoredAnswer) -> tuple[TouchEstimate, ...]:
-        """The confirmed tracks; roughly, those that were published last where nothing tells how they go on, or whether
-        they are one.
-        """
-        scan, published, now = self._measured.scan, self._now.published, self._skin.touches.now
-        passed_s, sample_s = (scan.sample_ns - self._now.published_ns) * 1e-9, scan.sample_ns * 1e-9
+        """Confirmed tracks; roughly, those published last where nothing tells how they go on, or if they are one."""
+        scan, published, now = self.measured.scan, self.now.published, self.skin.touches.now
+        passed_s, sample_s = (scan.sample_ns - self.now.published_ns) * 1e-9, scan.sample_ns * 1e-9
         if not answer.nearly_holds:
             return tuple(coasted(touch, passed_s) for touch in published)
         unexplained = float(np.linalg.norm(answer.residual)) / max(float(np.linalg.norm(innovation.y)), 1e-12)
         lasting = [track for track in now.tracks if track.confirmed and track.acts_at(sample_s)]
         open_ids = [track.id for track in (*now.tracks, *now.dropped) if not track.confirmed]
         return (
-            *(track.estimate(sample_s, self._measured.span_s, unexplained) for track in lasting),
+            *(track.estimate(sample_s, self.measured.span_s, unexplained) for track in lasting),
             *(coasted(touch, passed_s) for touch in published if touch.id in open_ids),
         )
 
     def _estimate(self, y: Array, sigma: Array, z2: float, changing: float) -> Estimate:
         """y, sigma (K,): log |Z| over what was predicted, and its standard deviation."""
-        measured, touches, judgements = self._measured, self._now.published, self._judgements
+        measured, touches, judgements = self.measured, self.now.published, self.judgements
         if measured.whole:
-            self._taring.saw(bool(touches) or z2 >= n.FALSE_ALARM_Z2)
+            self.taring.saw(bool(touches) or z2 >= n.FALSE_ALARM_Z2)
         judgements.append(judge("touch", max([z2, *(touch.z2 for touch in touches)]), n.FALSE_ALARM_Z2))
         alone = measured.scan.separate and not touches  # no further row tells whether anything touches
         judgements.append(judge("changing", changing, 1.0, turned=Verdict.REFUSE if alone else None))
-        explained = judge("explained", self._now.unexplained_s, n.CHANGING_S)
-        predicted = self._skin.tables.predicted
+        explained = judge("explained", self.now.unexplained_s, n.CHANGING_S)
+        predicted = self.skin.tables.predicted
         judgements.append(explained if predicted else explained._replace(verdict=Verdict.CANNOT))
-        electrodes = self._skin.faults.states()
+        electrodes = self.skin.faults.states()
         return Estimate(measured.scan, measured.whole, touches, electrodes, measured.live, y, sigma, tuple(judgements))
-
-
-def _nearly_as_likely(older: ScoredAnswer, likeliest: ScoredAnswer) -> bool:
-    """Whether an answer of an older baseline is to be preferred: it may be less likely, the more touches it saves."""
-    return older.score >= likeliest.score - n.YOUNGER * max(1, likeliest.count - older.count)
-
-
-def _strange(innovation: Innovation, answer: ScoredAnswer) -> bool:
-    """Whether a scan is none of a touch: the likeliest ones leave most of it, whatever they look like."""
-    unexplained, all_of_it = (float(np.sum(answer.white(each) ** 2)) for each in (answer.residual, innovation.y))
-    return unexplained > n.STRANGE * all_of_it
-
-
-def _drifted(found: Explanation) -> Array:
-    """(K,) what drifted under touches, as far as the scan tells it."""
-    view, grown = found.view, found.view.grown
-    return np.where(view.live, grown * (view.at.predicted.covariance @ (grown * found.answer.weighted_residual)), 0.0)

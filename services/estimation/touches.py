@@ -1,6 +1,4 @@
-"""The tracks of a skin's touches from scan to scan: which go on, begin or end with the touches of a fit, their numbers,
-and what they leave in the foam.
-"""
+"""The tracks of touches: which go on, begin or end with a fit, their numbers, and what they leave in the foam."""
 
 from __future__ import annotations
 
@@ -68,9 +66,7 @@ class TouchTracks:
         return any(track.contact_due for track in self.lasting)
 
     def claim_recount(self) -> bool:
-        """Whether it is time to ask if a touch is several: while it is new, each time its outline became odder, and now
-        and then. They count as asked from then on.
-        """
+        """Whether to ask if one is several: while it is new, odder than before, now and then. It counts as asked."""
         due = False
         for track in self.lasting:
             odd = oddness(track.shape)
@@ -140,9 +136,7 @@ class TouchTracks:
         return [k for k, gap in zip(lasting, nearest, strict=True) if gap < tracks[k].radius]
 
     def associated(self, fit: FoundTouches, association: Sequence[int]) -> tuple[int, ...]:
-        """association, where touches that were found anew are those that were there before in the same places: also a
-        part of one that is several by now.
-        """
+        """association, where touches that were found anew continue tracks in the same places, or parts of one."""
         free = [k for k, track in enumerate(self.now.tracks) if k not in association and not track.ended]
         found = list(association)
         for k, place in enumerate(association):

@@ -201,9 +201,7 @@ class TrackedTouch:
         self.shape, self.shape_variance = np.zeros(len(SHAPE_SDS)), SHAPE_SDS**2
 
     def average_place(self, share: float) -> None:
-        """The place where it stays is the mean of where it was since it came: one that followed it would never be left.
-        share: that this scan has of it.
-        """
+        """The place where it stays, a mean: one that followed it would never be left. share: of this scan."""
         if self.scans <= 1:  # it has just come: places of before were rough
             share = 1.0
         x, y, log_radius = (

@@ -50,9 +50,7 @@ def _associate(skin: TaredSkin, answer: ScoredAnswer, fit: FoundTouches, measure
 
 
 def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> None:
-    """A touch is shown at once where its scan is explained with it: a rough start may be anything. One that stands by
-    itself (separate) is the end, too.
-    """
+    """Show at once what explains its scan (a rough start may be anything), or what no other scan follows."""
     separate, whole = measured.scan.separate, measured.whole
     if not (answer.explained or separate) or 2 * answer.over < n.SURE_Z2:
         return
@@ -61,11 +59,11 @@ def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> No
     for track in skin.touches.now.tracks:
         # How strongly it presses a first part hardly tells: its place and that it is there, it does.
         placed = place_tells and track.place_sd < n.PLACED and track.z2 > n.PLACED_Z2
-        told = (track.z2 > least_z2 or placed) and not skin.faults.in_question(track.state)
+        surely = (track.z2 > least_z2 or placed) and not skin.faults.in_question(track.state)
         # One that is broad may be two that began together, and is where neither of them is.
         broad = bool(track.state[LOG_RADIUS] > np.log(n.BROAD)) and track.scans < n.SURE_SCANS
         waits = may_wait and (broad or (track.jumped and not whole))
-        track.confirmed = (track.confirmed or told) and not waits
+        track.confirmed = (track.confirmed or surely) and not waits
 
 
 def _least_z2(skin: TaredSkin, answer: ScoredAnswer, separate: bool) -> float:
@@ -103,9 +101,7 @@ def _doubt(skin: TaredSkin, innovation: Innovation, answer: ScoredAnswer, measur
 def _needed(
     track: TrackedTouch, touches: TouchTracks, answer: ScoredAnswer, other: ScoredAnswer, strange: bool
 ) -> bool:
-    """Whether scans need a touch: several of them, or this one, where it was there before anybody watched: what begins
-    while somebody does may be how others begin. other: the answer without it.
-    """
+    """Whether several scans need a touch, or this one a touch that nobody saw begin. other: without it."""
     acts, alone = track.z2 > n.ACTS_Z2, len(touches) == 1  # alone: something touches, be its strength known or not
     if track.scans >= n.SURE_SCANS and (alone or acts) and not strange:
         return True

@@ -37,9 +37,7 @@ class UnexplainedLoad:
         self.now.seconds += seconds
 
     def explained(self, at_s: float) -> list[Memory]:
-        """Scans are explained from at_s on; what whatever pressed before may have left: nothing where no scan was
-        refused for long, for then it was followed.
-        """
+        """Scans are explained from at_s on: what whatever pressed before may have left. What was short was followed."""
         column, seconds = self.now.column, self.now.seconds
         if not seconds:
             return []

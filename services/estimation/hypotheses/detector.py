@@ -57,9 +57,7 @@ class TouchDetector:
         return sharper if sharper.z2 > whole.z2 * (1 + 2 * self._wrong) else whole
 
     def _sharper(self, innovation: Innovation, answer: ScoredAnswer, best: Detection) -> Detection:
-        """The same disc from the likeliest instant on: a strong touch tells it to a measurement or two, and none of its
-        columns makes up for one that is off by more.
-        """
+        """The same disc since the likeliest instant: a strong touch tells it to a measurement or two, and must."""
         instants = innovation.instants
         column = self._grid.responses[best.disc].astype(float)
         columns = column[:, None] * (innovation.times_s[:, None] >= instants)
@@ -72,9 +70,7 @@ class TouchDetector:
         return Detection(float(z2[k]), best.disc, float(along[k] / exact[k]), float(instants[k]))
 
     def _shares(self, acts: NDArray[np.float32], white: Whitening) -> NDArray[np.float32]:
-        """(A, n) share of each disc's information that the measurements have in which it acts (K, n), by their own
-        precisions; the first acts in all.
-        """
+        """(A, n) share of each disc's information in the values in which it acts (K, n); the first acts in all."""
         precision = white.conditional_precisions().astype(np.float32)
         information = self._squares @ (precision[:, None] * acts)
         shares = information / information[:, :1] + np.float32(1e-3)

@@ -40,6 +40,7 @@ from services.estimation.hypotheses.innovation import (
     LOG_PRIORS,
     MEMORY,
     NOISE,
+    ONSETS,
     Innovation,
     Priors,
     ScoredAnswer,
@@ -81,7 +82,7 @@ def _releases(
         ends_s = np.append(ends_s, np.inf)
     for ramp_s in RAMPS_S:
         acts = np.clip(0.5 + (ends_s - innovation.times_s[:, None]) / ramp_s, 0.0, 1.0)
-        at_s = np.append(-np.inf, ends_s[1:]) if ramp_s == AT_ONCE_S else ends_s
+        at_s = np.append(-np.inf, ends_s[1:]) if ramp_s == AT_ONCE_S else ends_s  # nothing tells it from one before
         yield at_s, others + own, own[:, None] * (acts - 1)
 
 
@@ -95,7 +96,7 @@ class Hypotheses:
         # Touches that nothing explains for certain must not be taken for noise.
         self._wider = WIDER if tables.predicted else (MEMORY, DRIFT, BURST)
         self.process_noise_scale = 1.0  # times the faster drift: grows while nothing explains the skin
-        self.wide = False  # the touches that stand were explained by a response that is wrong by more than it should be
+        self.wide = False  # the tracked touches were explained by a response that is wrong by more than it should be
 
     def through(self, slopes: Array) -> Hypotheses:
         """The same of a skin that is seen through a fault of the wires; slopes (K, K)."""
@@ -167,9 +168,7 @@ class Hypotheses:
         return best if float(best.fit.states[:, ACTION].sum()) > n.START_SEEN else None
 
     def ask(self, innovation: Innovation, tracked: Priors, manoeuvring: Priors) -> ScoredAnswer:
-        """The likeliest answer. tracked, manoeuvring: what is known of the touches that there were, if they go on as
-        they did, and if they have begun to move or to change.
-        """
+        """The likeliest answer. tracked, manoeuvring: priors of tracks, as they go on or move and change anew."""
         if tracked:
             answers = self._of_tracked(innovation, tracked, manoeuvring)
         else:
@@ -182,23 +181,20 @@ class Hypotheses:
         return replace(best, over=best.score - max(answer.score for answer in answers if answer.fit is None))
 
     def on_electrode(self, innovation: Innovation, place: Array, second: Array) -> ScoredAnswer:
-        """The likeliest small touch on an electrode. place (2,): its middle; second (K, n): what a touch does there
-        by the square of its action.
-        """
+        """The likeliest small touch at a place (2,). second (K, n): what one does there by the square of its action."""
         out = place / max(float(np.hypot(*place)), LEAST_ACTION)
-        found: ScoredAnswer | None = None
+        found = list[ScoredAnswer]()
+        action = 0.0  # of the likeliest so far
         for inside, along in ON_ELECTRODE:
             x, y = place - inside * out + along * np.array([-out[1], out[0]])
             prior = anywhere(float(x), float(y), 0.0, innovation.span_s)
             prior.start[LOG_RADIUS] = np.log(SMALL_RADIUS)
-            action = 0.0 if found is None or found.fit is None else float(found.fit.states[0, ACTION])
             more = action**2 * second
             wider = replace(innovation, covariance=innovation.covariance + more @ more.T)
-            answer = self.fitted(wider, [prior], (-1,))
-            if found is None or answer.score > found.score:
-                found = answer
-        assert found is not None
-        return found
+            found.append(self.fitted(wider, [prior], (-1,)))
+            best = max(found, key=lambda answer: answer.score)
+            action = 0.0 if best.fit is None else float(best.fit.states[0, ACTION])
+        return best
 
     def without(self, innovation: Innovation, tracked: Priors, place: int) -> ScoredAnswer:
         """The answer that one of the touches is none: there is nothing, or it is drift, or what foam remembers."""
@@ -257,9 +253,7 @@ class Hypotheses:
         return found
 
     def _continued(self, innovation: Innovation, manoeuvring: Priors) -> list[ScoredAnswer]:
-        """What nearly explained the part before, a step further: the tracked touches, and the new ones beside them; or
-        foam remembers more of what went.
-        """
+        """What nearly explained the part before, a step further; or foam remembers more of what went."""
         priors, association = list(manoeuvring), list(range(len(manoeuvring)))
         for candidate, place in zip(innovation.candidates, innovation.places, strict=True):
             if place < 0:
@@ -336,24 +330,23 @@ class Hypotheses:
         known: KnownWhitening | None = None,
         turned: Turned | None = None,
     ) -> ScoredAnswer:
-        """association: None: each of the priors is of the tracked touch in its place. known, turned: of a moment ago,
-        where they are as good as this scan's own.
-        """
+        """association: None: priors are those of the tracks. known, turned: of a moment ago, as good as its own."""
         association = tuple(range(len(priors))) if association is None else association
         wide = self.wide if wide is None else wide
         course = TouchCourse(self.response, innovation.times_s, innovation.span_s)
         live, tables = int(innovation.live.sum()), self._tables
         misfit = max(float(MISFIT_WIDE), 2 * tables.wrong) if wide else tables.wrong
         covariance = innovation.covariance if tables.map is None else innovation.covariance + tables.map.error
-        scene = FittedScan(innovation.y, covariance, course, tables.misfit, live, known, turned, innovation.sample_s)
+        sample_s = innovation.scan.sample_ns * 1e-9 - innovation.middle_s
+        scene = FittedScan(innovation.y, covariance, course, tables.misfit, live, known, turned, sample_s)
         affordable = max(0.0, innovation.budget.left - innovation.keeps) / len(priors)
         fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(affordable)))
         innovation.budget.left -= (fit.steps + 1) * len(fit)
         cost = n.LOG_PRIOR_WIDE if wide and not self.wide else LOG_PRIORS[cause]
         score = fit.evidence + cost + innovation.touch_log_prior * sum(place < 0 for place in association)
         near = innovation.whole and not apart(fit.states, association)
-        told = fit.chi2, np.inf, score, fit.white, fit.weighted_residual, fit.left
-        answer = ScoredAnswer(cause, fit, association, *told, near=near, wide=wide)
+        of_fit = fit.chi2, np.inf, score, fit.white, fit.weighted_residual, fit.left
+        answer = ScoredAnswer(cause, fit, association, *of_fit, near=near, wide=wide)
         return replace(answer, next_touch_z2=self.detector.best(innovation, answer).z2)
 
     def search(
@@ -372,7 +365,7 @@ class Hypotheses:
                 if found[0].explained:
                     break
             more = self.fitted(innovation, [*started(discs.fit), plain(new)], association)
-            if more.score < discs.score + innovation.least_gain:
+            if more.score < discs.score + (0.0 if innovation.whole else n.ANOTHER):
                 break
             discs = more
             found += self._outlined(innovation, priors, discs)
@@ -384,8 +377,9 @@ class Hypotheses:
         """The likeliest one in what others leave; None where it would not be seen, or may not be looked for."""
         if discs.count >= n.MOST_TOUCHES or innovation.spent:
             return None
-        found = self.detector.best(innovation, discs, innovation.onsets)
-        if found.z2 < innovation.least_z2:
+        # None where all values are of one instant.
+        found = self.detector.best(innovation, discs, ONSETS if np.ptp(innovation.times_s) > 0 else ())
+        if found.z2 < (n.ANOTHER_Z2 if innovation.whole else n.FALSE_ALARM_Z2):
             return None
         x, y = self.grid.discs[found.disc, PLACE]
         return replace(anywhere(x, y, found.action, innovation.span_s), since_s=found.since_s)
@@ -423,9 +417,7 @@ class Hypotheses:
         return [one_less, *self._wide(innovation, one_less)]
 
     def _begun_otherwise(self, innovation: Innovation, tracked: Priors) -> list[TouchPrior] | None:
-        """A touch that began within these values did so at another instant than the first of them told; None where
-        none did. The instant is the likeliest, whatever the action.
-        """
+        """Those that began within these values, at the likeliest instants for any action; None where none did."""
         first_s = -0.5 * innovation.span_s
         young = [k for k, prior in enumerate(tracked) if prior.since_s > first_s and prior.until_s == np.inf]
         if not young:
@@ -448,9 +440,7 @@ class Hypotheses:
         return priors
 
     def _turned(self, innovation: Innovation, tracked: Priors, turn: StrengthStep | None) -> list[ScoredAnswer]:
-        """How strongly they act changed at once: one of them in mid-scan, or any at its end, as they go or are pressed
-        harder.
-        """
+        """Strengths changed at once: that of one in mid-scan, or any at its end, as they go or are pressed harder."""
         priors = list(tracked)
         for k, prior in enumerate(tracked):
             # Until then it acts as it did, since a scan before this one: else two that begin would look like one.

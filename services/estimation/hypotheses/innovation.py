@@ -39,9 +39,7 @@ class StepBudget:
 
     @classmethod
     def of(cls, new: float, separate: bool) -> StepBudget:
-        """Of a scan of whose values this share is new: the next comes the sooner, the fewer there are. separate: none
-        follows that could go on with what this one leaves open.
-        """
+        """new: share of its values: the fewer, the sooner the next comes. separate: none follows on it."""
         steps = n.MOST_STEPS * max(float(n.LEAST_BUDGET), new)
         return cls(steps * n.SEPARATE if separate else steps)
 
@@ -78,11 +76,6 @@ class Observation:
         return self.middle_s + self.span_s / 2
 
     @property
-    def sample_s(self) -> float:
-        """For when what touches is estimated, from the middle of the scan on."""
-        return self.scan.sample_ns * 1e-9 - self.middle_s
-
-    @property
     def times_s(self) -> Array:
         """(K,) from the middle of the scan."""
         return self.span_s / 2 - self.scan.ages_s
@@ -95,9 +88,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class Innovation(Observation):
-    """The innovation of one scan: y over the prediction without touches, its covariance S, and what is known of the
-    touches that there may be; with the steps that hypotheses about it may cost.
-    """
+    """y over the prediction without touches, its covariance S, and what is known of touches that there may be."""
 
     y: Array  # (K,) log |Z| over the prediction; 0 where a measurement does not count
     covariance: Array  # (K, K)
@@ -112,31 +103,14 @@ class Innovation(Observation):
 
     @property
     def touch_log_prior(self) -> float:
-        """Of a touch that begins [nat]. How many touch is decided by evidence alone in a whole scan: a part leaves more
-        open.
-        """
+        """Of a touch that begins [nat]. In a whole scan evidence alone says how many: a part leaves more open."""
         return n.LOG_PRIOR_TOUCH + (n.WIDE_START if self.whole else 0.0)
-
-    @property
-    def least_z2(self) -> float:
-        """z^2 of a further disc that is tried."""
-        return float(n.ANOTHER_Z2 if self.whole else n.FALSE_ALARM_Z2)
-
-    @property
-    def least_gain(self) -> float:
-        """Evidence that a further touch must add [nat]."""
-        return 0.0 if self.whole else float(n.ANOTHER)
 
     @cached_property
     def instants(self) -> Array:
         """(n,) before which values something may begin or end at once: what the last few alone say, the next tell."""
         times_s = np.sort(self.times_s)
         return np.asarray(times_s[times_s <= (ONSETS[-1] - 0.5) * self.span_s]) - JUST_BEFORE_S
-
-    @property
-    def onsets(self) -> tuple[float, ...]:
-        """Shares of the scan after which a disc is looked for: none where all values are of one instant."""
-        return ONSETS if np.ptp(self.times_s) > 0 else ()
 
     def leaving(self, share: float) -> Innovation:
         """The same, which leaves so much of its steps to the next."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,31 +23,39 @@ from services.estimation.tared import TaredSkin
 from services.estimation.values import numbers as n
 
 
+@dataclass
 class HypothesisSelection:
     """Which hypotheses are asked of one scan, and which of their answers is taken."""
 
-    def __init__(self, skin: TaredSkin, measured: Observation, predicted: Prediction, unexplained_s: float) -> None:
-        """unexplained_s: for how long nothing has explained the scans before."""
-        self._skin, self._tables, self._measured = skin, skin.tables, measured
-        self._predicted, self._unexplained_s = predicted, unexplained_s
-        self._searched = False  # anew, whatever is tracked: once, it costs four scans' steps
-        self._scans = round(unexplained_s / measured.span_s)  # that nothing explained
-        self._due = not self._scans & (self._scans - 1)  # ever more seldom: at 1, 2, 4, 8 ... of them
+    skin: TaredSkin
+    measured: Observation
+    predicted: Prediction
+    unexplained_s: float  # for which nothing has explained the scans before
+    searched: bool = False  # anew, whatever is tracked: once, it costs four scans' steps
+
+    @property
+    def _unexplained_scans(self) -> int:
+        return round(self.unexplained_s / self.measured.span_s)
+
+    @property
+    def _due(self) -> bool:
+        """Ever more seldom while nothing explains them: at 1, 2, 4, 8 ... scans."""
+        return not self._unexplained_scans & (self._unexplained_scans - 1)
 
     def answer(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """The likeliest one."""
-        if not self._tables.predicted:
+        if not self.skin.tables.predicted:
             return self._of_measured(hypotheses, innovation)
-        if self._unexplained_s > n.LOST_S:
+        if self.unexplained_s > n.LOST_S:
             return self._of_lost(hypotheses, innovation)
         return self._of_touched(hypotheses, innovation)
 
     def _of_touched(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
-        if not len(self._skin.touches):
+        if not len(self.skin.touches):
             return self._of_untouched(hypotheses, innovation)
-        tracked = self._skin.touches.expected(self._measured)
-        manoeuvring = self._skin.touches.expected(self._measured, manoeuvring=True)
-        if self._skin.touches.lost:
+        tracked = self.skin.touches.expected(self.measured)
+        manoeuvring = self.skin.touches.expected(self.measured, manoeuvring=True)
+        if self.skin.touches.lost:
             return _judged_by_itself(hypotheses, innovation, tracked, manoeuvring)
         for answer in self._first_of_whole(hypotheses, innovation, tracked):
             if answer.explained:
@@ -58,10 +66,10 @@ class HypothesisSelection:
         self, hypotheses: Hypotheses, innovation: Innovation, tracked: Priors
     ) -> Iterator[ScoredAnswer]:
         """What is asked of a whole scan before all else."""
-        if not self._measured.whole:
+        if not self.measured.whole:
             return
-        if self._unexplained_s > 0 and self._due and not self._searched:
-            self._searched = True  # they may be others than those that are tracked
+        if self.unexplained_s > 0 and self._due and not self.searched:
+            self.searched = True  # they may be others than those that are tracked
             yield self._from_nothing(hypotheses, innovation)
         if hypotheses.wide:  # they stay as they are, and their response is as wrong as it should be
             yield hypotheses.fitted(innovation, tracked, most_steps=n.STEPS_WARM, wide=False)
@@ -69,24 +77,18 @@ class HypothesisSelection:
     def _of_untouched(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """Where nothing touched: nothing does, or what presses again where foam remembers more than it may, or all."""
         quiet = hypotheses.untouched(innovation)
-        memory = self._skin.drift.beyond_memory(self._predicted, quiet.weighted_residual, quiet.white)
-        if memory is not None and self._measured.whole and self._skin.faults.now.wire is None:
+        memory = self.skin.drift.beyond_memory(self.predicted, quiet.weighted_residual, quiet.white)
+        if memory is not None and self.measured.whole and self.skin.faults.now.wire is None:
             pressed = hypotheses.fitted(innovation, [anywhere(memory.x, memory.y, 0.0, innovation.span_s)], (-1,))
             if pressed.explained:
                 return pressed
         return quiet if quiet.quiet else hypotheses.ask(innovation, (), ())
 
     def recounted(self, hypotheses: Hypotheses, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
-        """An answer, or rather more touches than it has, or fewer. Asked with steps of its own: what explains a scan
-        badly has spent those of the scan, and would never be asked otherwise.
-        """
-        if not self._measured.whole or answer.fit is None or any(prior.until_s < np.inf for prior in answer.fit.priors):
+        """An answer, or more touches, or fewer, with steps of its own: a bad one has spent those of the scan."""
+        if not self._recount_due(answer):
             return answer
-        separate = self._measured.scan.separate
-        if not (_strained(answer) or self._skin.touches.claim_recount() or separate) or not (
-            answer.explained or self._due
-        ):
-            return answer
+        separate = self.measured.scan.separate
         own = replace(innovation, budget=StepBudget.of(1.0, separate), keeps=0.0)
         recount = SplitMergeTest(hypotheses, separate)
         other = found = recount(own, answer)
@@ -95,32 +97,37 @@ class HypothesisSelection:
             found = other or found
         if found is None or found.fit is None:
             return answer
-        if found.count < answer.count and self._skin.touches.meeting(self._measured):
+        if found.count < answer.count and self.skin.touches.meeting(self.measured):
             return answer  # they stood apart a moment ago: that they are several is known
-        association = self._skin.touches.associated(found.fit, found.association)
+        association = self.skin.touches.associated(found.fit, found.association)
         known = sum(place >= 0 for place in association)
         return replace(found, association=association, score=found.score - own.touch_log_prior * known, recounted=True)
 
+    def _recount_due(self, answer: ScoredAnswer) -> bool:
+        fit, whole, separate = answer.fit, self.measured.whole, self.measured.scan.separate
+        if not whole or fit is None or any(prior.until_s < np.inf for prior in fit.priors):
+            return False
+        roughly = answer.cause != AS_IT_IS or not answer.explained or (answer.wide and -1 in answer.association)
+        return (roughly or self.skin.touches.claim_recount() or separate) and (answer.explained or self._due)
+
     def _of_measured(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
-        """Of a skin whose touches no response tells, or one that real touches differ from by more than anybody knows.
-        While something touches that nothing explains, all else is asked seldom.
-        """
-        map_known = self._tables.tells
-        often = self._unexplained_s <= n.CHANGING_S or not self._scans % n.LOST_SCANS
+        """Of a skin whose touches no response tells surely. While nothing explains scans, all else is asked seldom."""
+        map_known = self.skin.tables.tells
+        often = self.unexplained_s <= n.CHANGING_S or not self._unexplained_scans % n.LOST_SCANS
         if not often:
             innovation.budget.left = 0.0
-        elif map_known and len(self._skin.touches):
+        elif map_known and len(self.skin.touches):
             return self._of_touched(hypotheses, innovation)
-        found = hypotheses.of_unmodelled(innovation, self._skin.refused.now.column, often and not map_known)
+        found = hypotheses.of_unmodelled(innovation, self.skin.refused.now.column, often and not map_known)
         if found.quiet or not (often and map_known):
             return found
         return self._of_touched(hypotheses, innovation)
 
     def _of_lost(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """While nothing has explained the skin for long: a search now and then, from nothing."""
-        self._skin.remember(self._skin.touches.forget(self._measured.oldest_s))
+        self.skin.remember(self.skin.touches.forget(self.measured.oldest_s))
         found = hypotheses.glance(innovation)
-        if found.quiet or not self._measured.whole or self._scans % n.LOST_SCANS:
+        if found.quiet or not self.measured.whole or self._unexplained_scans % n.LOST_SCANS:
             return found
         return self._from_nothing(hypotheses, innovation)
 
@@ -132,16 +139,9 @@ class HypothesisSelection:
 def _judged_by_itself(
     hypotheses: Hypotheses, innovation: Innovation, tracked: Priors, manoeuvring: Priors
 ) -> ScoredAnswer:
-    """After lost time, or a board's reset, nothing vouches for what touched before. The likeliest of: the touches that
-    there were, which count as new ones; others, or none.
-    """
+    """After a gap nothing vouches for the tracks: they count as new touches, and compete with others and with none."""
     anew = hypotheses.ask(innovation.leaving(0.5), (), ())
     before = hypotheses.ask(innovation, tracked, manoeuvring)
     known = sum(place >= 0 for place in before.association)
     vouched = replace(before, score=before.score + innovation.touch_log_prior * known)
     return max((anew, vouched), key=lambda answer: (answer.holds, answer.score))
-
-
-def _strained(answer: ScoredAnswer) -> bool:
-    """Whether touches explain a scan only roughly, or with the help of something else."""
-    return answer.cause != AS_IT_IS or not answer.explained or (answer.wide and -1 in answer.association)

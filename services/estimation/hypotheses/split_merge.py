@@ -78,9 +78,7 @@ class SplitMergeTest:
         return found
 
     def _halved(self, innovation: Innovation, begun: Priors, discs: ScoredAnswer, one: int) -> list[ScoredAnswer]:
-        """Two discs instead of one: a disc beside one that lies between two leads to neither. begun: the touches of
-        those discs, with their outlines.
-        """
+        """Two discs instead of one, as one beside it leads to neither. begun: the touches of those discs, outlined."""
         fit = discs.fit
         if fit is None or len(fit) >= n.MOST_TOUCHES:
             return []
@@ -96,9 +94,7 @@ class SplitMergeTest:
         return [other for other in both if other.fit is not None and gaps(other.fit.states).min() > 0]
 
     def _halves(self, innovation: Innovation, fit: FoundTouches, one: int) -> list[TouchPrior]:
-        """The two discs that explain most of what one does, on either side of its middle; empty where none explain
-        more than that one, and the next scans are asked too.
-        """
+        """The two discs beside its middle that explain most of what one does; empty where none explain more than it."""
         white, response = innovation.white, self._hypotheses.response
         each = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) for s in fit.states]
         target = white(np.where(innovation.live, np.expm1(innovation.y) - sum(each) + each[one], 0.0))
