@@ -1,4 +1,4 @@
-"""TouchTracks fitted to one scan by Gauss-Newton in the whitened space of everything that is no touch.
+"""Touches fitted to one scan by Gauss-Newton in the whitened space of everything that is no touch.
 
     y = log(1 + m(states) + D shapes + K kinks) + e,        e ~ N(0, S + (misfit |m|)^2 M)
 
@@ -14,21 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from models.measurement import numbers as n
 from models.measurement.course import STRENGTH, Kinks, TouchColumns, TouchCourse
 from models.measurement.covariance.whitening import Whitening, diagonal_of, factor
-from models.measurement.numbers import (
-    DAMPING,
-    DONE,
-    DONE_SHARE,
-    LEAST_ACTION,
-    LEAST_STEP,
-    LINEAR,
-    MISFIT,
-    STEP_LOG,
-    STEP_SHARE,
-    TURNS,
-    TURNS_LOG,
-)
 from models.measurement.touch import (
     ACTION,
     LOG_RADIUS,
@@ -60,6 +48,10 @@ class KnownWhitening:
     white: Whitening
     size2: float
 
+    def fits(self, size2: float) -> bool:
+        """Whether the misfit of touches of another squared change is nearly the same."""
+        return SIZE_CHANGED[0] < size2 / self.size2 < SIZE_CHANGED[1]
+
 
 @dataclass(frozen=True)
 class Turned:
@@ -73,7 +65,7 @@ class Turned:
         if states.shape != self.states.shape:
             return False
         away = np.abs(states - self.states)
-        return not ((away[:, PLACE] > TURNS).any() or (away[:, LOG_RADIUS] > TURNS_LOG).any())
+        return not ((away[:, PLACE] > n.TURNS).any() or (away[:, LOG_RADIUS] > n.TURNS_LOG).any())
 
 
 @dataclass(frozen=True)
@@ -126,8 +118,8 @@ class FoundTouches:
 
 
 @dataclass
-class _Point:
-    """One linearisation."""
+class _Linearisation:
+    """About some states, shapes and kinks."""
 
     states: Array
     rest: Array  # shapes and kinks
@@ -140,8 +132,8 @@ class _Point:
 
 
 @dataclass(frozen=True)
-class _Normal:
-    """Normal equations of one linearisation."""
+class _NormalEquations:
+    """Of one linearisation."""
 
     measured: Array  # (N, N) of the measurements alone
     precision: Array  # (N,) of the priors
@@ -161,55 +153,44 @@ class _Normal:
         return np.full_like(self.slope, np.nan) if failed else np.asarray(step)
 
 
-@dataclass(frozen=True)
-class _Linear:
-    """A linearisation solved: its posterior, and the step to its optimum."""
-
-    solved: Array  # (N, N)
-    log_det: float
-    precision: Array  # (N,) of the priors
-    step: Array  # (N,)
-    gains: float  # of the objective, by that step
-
-
 class TouchFitter:
     """Gauss and Newton's steps, damped as Levenberg's, to the maximum a posteriori of some touches; at it, Laplace's
     approximation.
     """
 
-    def __init__(self, scene: FittedScan, priors: Sequence[TouchPrior], misfit: float = MISFIT) -> None:
+    def __init__(self, scene: FittedScan, priors: Sequence[TouchPrior], misfit: float = n.MISFIT) -> None:
         self._scene, self._priors, self._misfit = scene, tuple(priors), misfit
-        self._count = len(self._priors)
-        self._mean = np.concatenate([prior.mean for prior in self._priors])
-        self._precision = np.concatenate([prior.sd for prior in self._priors]) ** -2.0
         self._shaped = not all(is_disc(prior) for prior in self._priors)
         shaped = self._priors if self._shaped else ()
-        self._shape_mean = np.concatenate([np.zeros(0), *(prior.shape for prior in shaped)])
-        self._shape_precision = np.concatenate([np.zeros(0), *(prior.shape_sd**-2.0 for prior in shaped)])
+        means = [*(prior.mean for prior in self._priors), *(prior.shape for prior in shaped)]
+        sds = [*(prior.sd for prior in self._priors), *(prior.shape_sd for prior in shaped)]
+        self._mean, self._precision = np.concatenate(means), np.concatenate(sds) ** -2.0
+        self._states = STATES * len(self._priors)
+        self._shapes = len(self._mean) - self._states
         self.steps = 0
 
     def fit(self, most_steps: int) -> FoundTouches:
         """Raises ValueError where a covariance is none."""
         states = within_limits(np.stack([prior.start for prior in self._priors]))
         self._kinks = list[Kinks]()
-        rest = self._turn(states, self._shape_mean)
+        rest = self._turn(states, self._mean[self._states :])
         columns = self._columns(states)
         self._whiten(states, columns)
         states, columns = self._first_actions(states, columns)
-        point = self._descend(self._point(states, rest, columns), most_steps)
-        changed, moved = _changed(self._size2(point.columns), self._known), self._moved(point.states)
+        point = self._descend(self._linearised(states, rest, columns), most_steps)
+        changed, moved = not self._known.fits(_size2(point.columns)), self._moved(point.states)
         rest = self._turn(point.states, point.rest) if moved else point.rest
         if changed:
             self._whiten(point.states, point.columns)
         if moved or changed:
-            point = self._descend(self._point(point.states, rest, self._columns(point.states, rest)), most_steps)
-        if self._size2(point.columns) < SIZE_CHANGED[0] * self._known.size2:  # larger touches' misfit explains anything
+            point = self._descend(self._linearised(point.states, rest, self._columns(point.states, rest)), most_steps)
+        if _size2(point.columns) < SIZE_CHANGED[0] * self._known.size2:  # larger touches' misfit explains anything
             self._whiten(point.states, point.columns)
-            point = self._point(point.states, point.rest, point.columns)
+            point = self._linearised(point.states, point.rest, point.columns)
         return self._posterior(point)
 
     def _columns(self, states: Array, rest: Array | None = None) -> TouchColumns:
-        kinked = None if rest is None else rest[len(self._shape_mean) :]
+        kinked = None if rest is None else rest[self._shapes :]
         directions = self._turned.directions if self._shaped else []
         return self._scene.course.columns(states, self._priors, directions, self._kinks, kinked)
 
@@ -223,14 +204,12 @@ class TouchFitter:
             known = Turned(states, course.directions(states) if self._shaped else [])
         self._turned = known
         self._kinks = course.kinks(states, self._priors)
-        shapes = len(self._shape_mean)
         bent = dict[tuple[int, int, int], Array]()
-        for kinks, among in zip(before, _each(before, shapes), strict=True):
+        for kinks, among in zip(before, _each(before, self._shapes), strict=True):
             bent[kinks.touch, kinks.bends, len(kinks)] = rest[among]
         kinked = [bent.get((k.touch, k.bends, len(k)), np.zeros(len(k))) for k in self._kinks]
-        made = np.concatenate([rest[:shapes], *kinked])
-        self._precisions = np.concatenate([self._precision, self._shape_precision, np.ones(len(made) - shapes)])
-        return made
+        self._precisions = np.concatenate([self._precision, *map(np.ones_like, kinked)])
+        return np.concatenate([rest[: self._shapes], *kinked])
 
     def _moved(self, states: Array) -> bool:
         """Whether their directions are others by now, or a course bends that was straight."""
@@ -239,9 +218,9 @@ class TouchFitter:
         both = zip(self._scene.course.bends(states, self._priors), self._bends, strict=True)
         return any((changes and not changed) or (moves and not moved) for (changes, moves), (changed, moved) in both)
 
-    def _descend(self, point: _Point, most_steps: int) -> _Point:
+    def _descend(self, point: _Linearisation, most_steps: int) -> _Linearisation:
         """Levenberg and Marquardt's steps until they gain nothing, or what is left to go is linear."""
-        damping = float(DAMPING)
+        damping = float(n.DAMPING)
         for _ in range(most_steps):
             normal = self._normal(point)
             step = normal.step(damping)
@@ -256,14 +235,14 @@ class TouchFitter:
                 point, damping = tried, max(damping / 10, 1e-5)
             else:
                 damping = max(damping * 20, 1e-2)
-            if abs(gained) < max(DONE, DONE_SHARE * point.objective) or damping > MOST_DAMPING:
+            if abs(gained) < max(n.DONE, n.DONE_SHARE * point.objective) or damping > MOST_DAMPING:
                 break
         return point
 
     def _whiten(self, states: Array, columns: TouchColumns) -> None:
-        size2, scene = max(self._size2(columns), 1e-12), self._scene
+        size2, scene = max(_size2(columns), 1e-12), self._scene
         known = scene.known
-        if known is not None and not _changed(size2, known):
+        if known is not None and known.fits(size2):
             self._known = known
             return
         covariance = scene.covariance + self._misfit**2 * size2 * scene.misfit
@@ -271,32 +250,25 @@ class TouchFitter:
         diagonal += scene.course.jitter(states, self._priors) ** 2
         self._known = KnownWhitening(Whitening.of(covariance), size2)
 
-    @property
-    def _white(self) -> Whitening:
-        return self._known.white
-
-    def _size2(self, columns: TouchColumns) -> float:
-        return float(columns.mean @ columns.mean)
-
     def _first_actions(self, states: Array, columns: TouchColumns) -> tuple[Array, TouchColumns]:
-        """TouchTracks whose action nobody knows yet begin with the likeliest."""
-        unknown = [n for n in range(self._count) if states[n, ACTION] == 0]
-        if not unknown:
+        """Touches whose action nobody knows yet begin with the likeliest."""
+        unknown = np.flatnonzero(states[:, ACTION] == 0)
+        if not len(unknown):
             return states, columns
         states = states.copy()
-        states[unknown, ACTION] = LEAST_ACTION
+        states[unknown, ACTION] = n.LEAST_ACTION
         columns = self._columns(states)
-        at = [STATES * n + ACTION for n in unknown]
-        response = self._white(columns.slopes[:, at])
-        known = columns.mean - columns.slopes[:, at].sum(axis=1) * LEAST_ACTION
-        seen = self._white(np.expm1(self._scene.y) - known)
+        at = STATES * unknown + ACTION
+        response = self._known.white(columns.slopes[:, at])
+        known = columns.mean - columns.slopes[:, at].sum(axis=1) * n.LEAST_ACTION
+        seen = self._known.white(np.expm1(self._scene.y) - known)
         found = np.linalg.lstsq(response, seen, rcond=None)[0]
-        states[unknown, ACTION] = np.maximum(found, LEAST_ACTION)
+        states[unknown, ACTION] = np.maximum(found, n.LEAST_ACTION)
         columns = self._columns(states)
         self._whiten(states, columns)
         return states, columns
 
-    def _point(self, states: Array, rest: Array, columns: TouchColumns) -> _Point:
+    def _linearised(self, states: Array, rest: Array, columns: TouchColumns) -> _Linearisation:
         y, states_of = self._scene.y, columns.slopes.shape[1]
         both = np.empty((len(y), 1 + states_of + len(rest)))  # the residual, and the slopes of log |Z|
         left, sloped = both[:, 0], both[:, 1:]
@@ -306,106 +278,99 @@ class TouchFitter:
         live = y != 0
         left[:] = np.where(live, y - np.log1p(change), 0.0)
         sloped *= np.where(live, 1 / (1 + change), 0.0)[:, None]
-        whitened = self._white(both)
+        whitened = self._known.white(both)
         residual, design = whitened[:, 0], whitened[:, 1:]
         off = self._off(states, rest)
         objective = float(residual @ residual + self._precisions @ off**2)
-        return _Point(states, rest, columns, left, sloped, residual, design, objective)
+        return _Linearisation(states, rest, columns, left, sloped, residual, design, objective)
 
     def _off(self, states: Array, rest: Array) -> Array:
         """From the priors' means."""
-        off = np.concatenate([states.ravel() - self._mean, rest])
-        off[self._mean.size : self._mean.size + self._shape_mean.size] -= self._shape_mean
+        off = np.concatenate([states.ravel(), rest])
+        off[: len(self._mean)] -= self._mean
         return off
 
-    def _normal(self, point: _Point) -> _Normal:
+    def _normal(self, point: _Linearisation) -> _NormalEquations:
         slope = point.design.T @ point.residual - self._precisions * self._off(point.states, point.rest)
-        return _Normal(point.design.T @ point.design, self._precisions, slope)
+        return _NormalEquations(point.design.T @ point.design, self._precisions, slope)
 
-    def _stepped(self, point: _Point, step: Array) -> _Point:
-        self._limit(point.states, step)
-        n = STATES * self._count
-        states = within_limits(point.states + step[:n].reshape(-1, STATES))
-        rest = point.rest + step[n:]
-        return self._point(states, rest, self._columns(states, rest))
+    def _stepped(self, point: _Linearisation, step: Array) -> _Linearisation:
+        """Each touch goes only so far that its disc stays near where it was."""
+        own = step[: self._states].reshape(-1, STATES)
+        for state, each in zip(point.states, own, strict=True):
+            most = max(n.STEP_SHARE * float(np.exp(state[LOG_RADIUS])), n.LEAST_STEP)
+            way = float(np.hypot(each[X], each[Y]))
+            each *= min(1.0, most / max(way, 1e-9), n.STEP_LOG / max(abs(each[LOG_RADIUS]), 1e-9))
+        states, rest = within_limits(point.states + own), point.rest + step[own.size :]
+        return self._linearised(states, rest, self._columns(states, rest))
 
     def _is_linear(self, states: Array, step: Array) -> bool:
         """Whether a step is so small that slopes hold: nothing new would be seen where it ends."""
-        n, half_s = STATES * self._count, self._scene.course.span_s / 2
-        moved = np.abs(step[:n].reshape(-1, STATES))
+        half_s = self._scene.course.span_s / 2
+        step = step[: self._states].reshape(-1, STATES)
+        moved = np.abs(step)
         radius, acts = np.exp(states[:, LOG_RADIUS]), np.abs(states[:, ACTION])
         way = np.hypot(moved[:, X], moved[:, Y]) + half_s * np.hypot(moved[:, VX], moved[:, VY])
-        if (way > LINEAR * radius).any() or (moved[:, LOG_RADIUS] > LINEAR).any():
+        if (way > n.LINEAR * radius).any() or (moved[:, LOG_RADIUS] > n.LINEAR).any():
             return False
-        if (moved[:, ACTION] + half_s * moved[:, RATE] > LINEAR * acts).any():
+        if (moved[:, ACTION] + half_s * moved[:, RATE] > n.LINEAR * acts).any():
             return False
-        there = states + step[:n].reshape(-1, STATES)
-        return bool((within_limits(there) == there).all())
+        return bool((within_limits(states + step) == states + step).all())
 
-    def _limit(self, states: Array, step: Array) -> None:
-        """Shorten each touch's step so that its disc stays near where it was."""
-        for n, state in enumerate(states):
-            own = step[STATES * n : STATES * (n + 1)]
-            way, most = float(np.hypot(own[X], own[Y])), max(STEP_SHARE * float(np.exp(state[LOG_RADIUS])), LEAST_STEP)
-            own *= min(1.0, most / max(way, 1e-9), STEP_LOG / max(abs(own[LOG_RADIUS]), 1e-9))
-
-    def _solve(self, point: _Point) -> _Linear:
+    def _posterior(self, point: _Linearisation) -> FoundTouches:
         normal = self._normal(point)
         w, log_density = factor(normal.damped(0.0))
         solved = w.T @ w
         step = solved @ normal.slope
-        return _Linear(solved, -2 * log_density, normal.precision, step, float(normal.slope @ step))
-
-    def _posterior(self, point: _Point) -> FoundTouches:
-        linear = self._solve(point)
-        occam = 0.5 * (linear.log_det - float(np.log(linear.precision).sum()))
-        n, shapes = STATES * self._count, len(self._shape_mean)
-        best = point.residual - point.design @ linear.step  # what the linear optimum would leave
+        occam = 0.5 * (-2 * log_density - float(np.log(self._precisions).sum()))
+        count = self._states
+        best = point.residual - point.design @ step  # what the linear optimum would leave
         states, rest, left, residual, objective = point.states, point.rest, point.left, point.residual, point.objective
-        if self._is_linear(states, linear.step):
-            states, rest = states + linear.step[:n].reshape(-1, STATES), rest + linear.step[n:]
-            left, residual, objective = left - point.sloped @ linear.step, best, objective - linear.gains
-        said = self._said(n, len(rest))
-        then = states + (said[:, n:] @ rest).reshape(-1, STATES)
+        if self._is_linear(states, step):
+            states, rest = states + step[:count].reshape(-1, STATES), rest + step[count:]
+            left, residual = left - point.sloped @ step, best
+            objective -= float(normal.slope @ step)
+        to_sample = self._to_sample(len(rest))
+        then = states + (to_sample[:, count:] @ rest).reshape(-1, STATES)
         then[:, ACTION] = np.minimum(then[:, ACTION], MOST_ACTS)
         if self._shaped:
-            outline, unsure = rest[:shapes], np.diag(linear.solved)[n : n + shapes]
+            outline, unsure = rest[: self._shapes], np.diag(solved)[count : len(self._mean)]
         else:
             outline = np.concatenate([prior.shape for prior in self._priors])
             unsure = np.concatenate([prior.shape_sd for prior in self._priors]) ** 2
         return FoundTouches(
             priors=self._priors,
             states=then,
-            covariance=said @ linear.solved @ said.T,
-            shapes=outline.reshape(self._count, SHAPES),
-            shape_variance=unsure.reshape(self._count, SHAPES),
+            covariance=to_sample @ solved @ to_sample.T,
+            shapes=outline.reshape(-1, SHAPES),
+            shape_variance=unsure.reshape(-1, SHAPES),
             chi2=float(residual @ residual) / max(self._scene.live, 1),
-            evidence=self._white.log_density - 0.5 * objective - occam,
-            white=self._white,
-            weighted_residual=self._white.w.T @ best,
+            evidence=self._known.white.log_density - 0.5 * objective - occam,
+            white=self._known.white,
+            weighted_residual=self._known.white.w.T @ best,
             left=left,
             design=point.design,
-            solved=linear.solved,
+            solved=solved,
             steps=self.steps,
             known=self._known,
             turned=self._turned,
         )
 
-    def _said(self, states: int, rest: int) -> Array:
-        """(7 T, N) from all that was solved for to the states that are said: kinks add to a touch's action then."""
-        said = np.eye(states, states + rest)
-        for kinks, among in zip(self._kinks, _each(self._kinks, states + len(self._shape_mean)), strict=True):
+    def _to_sample(self, rest: int) -> Array:
+        """(7 T, N) from all that was solved for to the states at the sample: kinks add to a touch's action then."""
+        to_sample = np.eye(self._states, self._states + rest)
+        for kinks, among in zip(self._kinks, _each(self._kinks, len(self._mean)), strict=True):
             if kinks.bends == STRENGTH and self._priors[kinks.touch].until_s == np.inf:
-                said[STATES * kinks.touch + ACTION, among] = self._scene.course.at(kinks.profiles, self._scene.sample_s)
-        return said
+                at_sample = self._scene.course.at(kinks.profiles, self._scene.sample_s)
+                to_sample[STATES * kinks.touch + ACTION, among] = at_sample
+        return to_sample
+
+
+def _size2(columns: TouchColumns) -> float:
+    return float(columns.mean @ columns.mean)
 
 
 def _each(kinks: Sequence[Kinks], first: int) -> list[slice]:
     """Where each of them is among all that is solved for, from place `first` on."""
     ends = first + np.cumsum([len(each) for each in kinks], dtype=int)
     return [slice(end - len(each), end) for each, end in zip(kinks, ends, strict=True)]
-
-
-def _changed(size2: float, known: KnownWhitening) -> bool:
-    """Whether the misfit of touches of this squared change is another."""
-    return not SIZE_CHANGED[0] < size2 / known.size2 < SIZE_CHANGED[1]

@@ -9,22 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.numbers import (
-    AREA_LOG_SD,
-    BEGINS_WITHIN,
-    EDGE_SD,
-    HARMONIC_SDS,
-    LEAST_ACTION,
-    LEAST_RADIUS,
-    MOST_ACTION,
-    MOST_RADIUS,
-    MOST_STRENGTH,
-    NEW_WAY,
-    SHEET,
-    STEADY,
-    TENSOR_SD,
-    TYPICAL_RADIUS,
-)
+from models.measurement import numbers as n
 
 Array = NDArray[np.float64]
 
@@ -41,10 +26,10 @@ PLACE, VELOCITY = slice(X, Y + 1), slice(VX, VY + 1)
 SHAPES = 9
 EDGE = 6
 PLAIN = 1e-3  # of what shapes differ by
-MOST_ACTS = float(MOST_STRENGTH * np.pi * MOST_RADIUS**2)  # unit^2: nothing conducts in the largest
+MOST_ACTS = float(n.MOST_STRENGTH * np.pi * n.MOST_RADIUS**2)  # unit^2: nothing conducts in the largest
 ANYWHERE_SD = 2.0  # unit: the sheet's width
 AT_ONCE_S = 4e-4  # one measurement: nothing begins faster
-SHAPE_SDS: Array = np.array([sd for sd in HARMONIC_SDS for _ in range(2)] + [EDGE_SD, TENSOR_SD, TENSOR_SD])
+SHAPE_SDS: Array = np.array([sd for sd in n.HARMONIC_SDS for _ in range(2)] + [n.EDGE_SD, n.TENSOR_SD, n.TENSOR_SD])
 
 
 @dataclass(frozen=True)
@@ -68,10 +53,10 @@ class TouchPrior:
 
 def anywhere(x: float, y: float, action: float, span_s: float) -> TouchPrior:
     """A touch that may be anywhere on the sheet, of any size, begin and move as touches do. span_s: of the scan."""
-    start = np.array([x, y, np.log(TYPICAL_RADIUS), action, 0.0, 0.0, 0.0])
-    mean = np.array([0.0, 0.0, np.log(TYPICAL_RADIUS), 0.0, 0.0, 0.0, 0.0])
-    rate_sd = BEGINS_WITHIN * max(action, LEAST_ACTION) / span_s
-    sd = np.array([ANYWHERE_SD, ANYWHERE_SD, AREA_LOG_SD, MOST_ACTION, rate_sd, NEW_WAY / span_s, NEW_WAY / span_s])
+    start = np.array([x, y, np.log(n.TYPICAL_RADIUS), action, 0.0, 0.0, 0.0])
+    mean = np.array([0.0, 0.0, np.log(n.TYPICAL_RADIUS), 0.0, 0.0, 0.0, 0.0])
+    rate_sd, way_sd = n.BEGINS_WITHIN * max(action, n.LEAST_ACTION) / span_s, n.NEW_WAY / span_s
+    sd = np.array([ANYWHERE_SD, ANYWHERE_SD, n.AREA_LOG_SD, n.MOST_ACTION, rate_sd, way_sd, way_sd])
     return TouchPrior(start, mean, sd)
 
 
@@ -82,7 +67,7 @@ def acting_steadily(prior: TouchPrior, action: float, span_s: float) -> TouchPri
     start, mean, sd = prior.start.copy(), prior.mean.copy(), prior.sd.copy()
     start[ACTION] = mean[ACTION] = action
     start[RATE] = mean[RATE] = 0.0
-    sd[ACTION] = STEADY * max(action, LEAST_ACTION)
+    sd[ACTION] = n.STEADY * max(action, n.LEAST_ACTION)
     sd[RATE] = sd[ACTION] / span_s
     return replace(prior, start=start, mean=mean, sd=sd)
 
@@ -109,12 +94,12 @@ def is_disc(prior: TouchPrior) -> bool:
 def within_limits(states: Array) -> Array:
     """(T, 7) states moved to where touches can be."""
     limited = states.copy()
-    limited[:, PLACE] = np.minimum(np.maximum(limited[:, PLACE], -SHEET), SHEET)
+    limited[:, PLACE] = np.minimum(np.maximum(limited[:, PLACE], -n.SHEET), n.SHEET)
     limited[:, ACTION] = np.minimum(limited[:, ACTION], MOST_ACTS)
     limited[:, RATE] = np.minimum(np.maximum(limited[:, RATE], -MOST_ACTS / AT_ONCE_S), MOST_ACTS / AT_ONCE_S)
-    acts = np.maximum(limited[:, ACTION], LEAST_ACTION)
-    least = np.maximum(0.5 * np.log(acts / (np.pi * MOST_STRENGTH)), np.log(LEAST_RADIUS))
-    limited[:, LOG_RADIUS] = np.minimum(np.maximum(limited[:, LOG_RADIUS], least), np.log(MOST_RADIUS))
+    acts = np.maximum(limited[:, ACTION], n.LEAST_ACTION)
+    least = np.maximum(0.5 * np.log(acts / (np.pi * n.MOST_STRENGTH)), np.log(n.LEAST_RADIUS))
+    limited[:, LOG_RADIUS] = np.minimum(np.maximum(limited[:, LOG_RADIUS], least), np.log(n.MOST_RADIUS))
     return limited
 
 
