@@ -186,7 +186,7 @@ class Preprocessing(Stage):
         out.score, out.threshold = touch.statistic, touch.expected
         self._counters["touched"] += out.touched
         if not estimate.scan.believed:
-            self._reconstruction.rest()  # a mean of the same scan again and again is no surer
+            self._reconstruction.reset()  # a mean of the same scan again and again is no surer
         live = estimate.live & np.isfinite(self._reconstruction.sigma) & (estimate.difference < MOST_LOG)
         z0 = baseline.z0 * np.exp(self._shift(estimate.scan))
         d = np.where(live, z0 * np.expm1(estimate.difference) / self.pre.normaliser(z0), 0.0)
@@ -194,7 +194,7 @@ class Preprocessing(Stage):
         out.sigma = np.where(live, self._reconstruction.sigma, np.inf).astype(np.float32)
         out.tare_frames = self._reconstruction.frames
         if not out.touched:
-            self._reconstruction.rest()
+            self._reconstruction.reset()
             self._worth_keeping()
         if out.touched or self.always_reconstruct or not self.config.touch.skip_untouched:
             self._reconstruct(out, d)

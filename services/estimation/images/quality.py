@@ -10,6 +10,7 @@ else.
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -33,10 +34,7 @@ class Conditioned(NamedTuple):
 
     whiten: NDArray[np.float32]  # (K, K)
     forward: NDArray[np.float32]  # (K, h * w), whitened
-    noise: float  # the energy that noise may leave; 0 where nothing can be told
-
-
-NOTHING = Conditioned(np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32), 0.0)
+    noise: float  # the energy that noise may leave
 
 
 class Residual:
@@ -49,8 +47,7 @@ class Residual:
         self.pre, self.to_scale = bundle.prereconstructor(), to_scale
         self.shape: tuple[int, int] = bundle.matrices.inside.shape
         self.refused = False  # whether the last image that was given a share is of no touch
-        self._sizes = (0, 0)
-        self._known: OrderedDict[bytes, Conditioned] = OrderedDict()
+        self._known: OrderedDict[bytes, Conditioned | None] = OrderedDict()
 
     def __call__(
         self, difference: NDArray[np.float32], sigma: NDArray[np.float32], image: NDArray[np.float32]
@@ -61,14 +58,14 @@ class Residual:
         h, w = self.shape
         if image.ndim != 2 or not image.size or image.shape[0] % h or image.shape[1] % w:
             return None
-        if len(difference) != self.pre.measurements or not (known := self._conditioned(sigma)).noise:
+        if len(difference) != self.pre.measurements or (known := self._conditioned(sigma)) is None:
             return None
         y = np.clip(image, np.float32(0.0), np.float32(MOST_DROP))
         if self.to_scale:
             np.subtract(np.float32(1.0), y, out=y)
             np.log(y, out=y)
             np.negative(y, out=y)
-        down, across = self._means(*image.shape)
+        down, across = _means(h, w, *image.shape)
         coarse = (down @ y @ across).ravel()
         seen, expected = known.whiten @ difference, known.forward @ coarse
         if not self.to_scale:
@@ -94,16 +91,8 @@ class Residual:
                 return True
         return False
 
-    def _means(self, rows: int, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(h, rows) and (columns, w): the mean over the pixels of each coarse one (a product is faster than `mean`)."""
-        if self._sizes != (rows, columns):
-            (h, w), self._sizes = self.shape, (rows, columns)
-            down = np.repeat(np.eye(h, dtype=np.float32), rows // h, axis=1) * np.float32(h / rows)
-            across = np.repeat(np.eye(w, dtype=np.float32), columns // w, axis=0) * np.float32(w / columns)
-            self._matrices = np.ascontiguousarray(down), np.ascontiguousarray(across)
-        return self._matrices
-
-    def _conditioned(self, sigma: NDArray[np.float32]) -> Conditioned:
+    def _conditioned(self, sigma: NDArray[np.float32]) -> Conditioned | None:
+        """None where too few measurements count."""
         key = sigma.tobytes()
         if key not in self._known:
             self._known[key] = self._condition(sigma)
@@ -112,10 +101,10 @@ class Residual:
         self._known.move_to_end(key)
         return self._known[key]
 
-    def _condition(self, sigma: NDArray[np.float32]) -> Conditioned:
+    def _condition(self, sigma: NDArray[np.float32]) -> Conditioned | None:
         live = np.isfinite(sigma)
         if live.sum() < len(sigma) / 4:
-            return NOTHING
+            return None
         operator = self.pre.condition(sigma.astype(float), drift=DRIFT, weights=live.astype(float))
         count = int(live.sum())
         return Conditioned(
@@ -123,3 +112,11 @@ class Residual:
             forward=np.ascontiguousarray(operator.whiten @ operator.jacobian, dtype=np.float32),
             noise=count + CHANCE * float(np.sqrt(2 * count)),
         )
+
+
+@lru_cache(maxsize=4)
+def _means(h: int, w: int, rows: int, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(h, rows) and (columns, w): the mean over the pixels of each coarse one (a product is faster than `mean`)."""
+    down = np.repeat(np.eye(h, dtype=np.float32), rows // h, axis=1) * np.float32(h / rows)
+    across = np.repeat(np.eye(w, dtype=np.float32), columns // w, axis=0) * np.float32(w / columns)
+    return np.ascontiguousarray(down), np.ascontiguousarray(across)

@@ -14,11 +14,11 @@ from services.estimation.values.state import shaped
 Array = NDArray[np.float64]
 
 CHANGED = 1e-3  # probability that an unchanged touch is reconstructed again: costs work, not truth
-LONGEST_MEAN = 16  # frames of a hold that are averaged at most, and after which it is reconstructed again at the latest
+LONGEST_MEAN = 16  # frames that are averaged at most, and after which a touch is reconstructed again at the latest
 MEANS = (1, 2, 4, 8, LONGEST_MEAN)  # frames in what is reconstructed of a touch
 KEPT = 16  # operators; 0.4 MB each
 SUREST = 1e-4  # relative: below it the model is what a mean is wrong by, and that does not average out
-REST_S = 0.25  # of the drift that skin.toml allows: what is left of it beside a touch
+DRIFTS_S = 0.25  # of the drift that skin.toml allows: what is left of it beside a touch
 FEWEST = 2  # finite measurements without which there is nothing to reconstruct
 
 
@@ -27,85 +27,12 @@ def sigma_of_mean(sigma: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     return np.asarray(sigma / np.sqrt(n), np.float32)
 
 
-class FrameAverager:
-    """Decides which frames of a touch are reconstructed, and from what: those since it last changed, by the whitened
-    energy of an image's operator. The limit allows for the noise having been estimated from few scans.
-
-    While nothing changes against the frame last reconstructed (not the previous frame: creep must be seen), frames are
-    averaged, and their mean is reconstructed after 2, 4, 8, 16, 32, 48 ... of them.
-    """
-
-    def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        self._live: NDArray[np.bool_] | None = None  # measurements that count in it
-        self._forget()
-
-    def _forget(self) -> None:
-        self._reference: Array | None = None  # the difference last reconstructed
-        self.averaged = 0  # frames in it
-        self._recent: deque[Array] = deque(maxlen=LONGEST_MEAN)
-        self._count = 0  # frames since the last change
-        self.scan = 0  # of the frame last reconstructed
-
-    def of(self, live: NDArray[np.bool_]) -> None:
-        """Which measurements count in the next frame. Frames of others make another image."""
-        if self._live is None or (live != self._live).any():
-            self._forget()
-        self._live = live
-
-    def __call__(self, d: Array, scan: int, operator: Operator, limit: float) -> Array | None:
-        """The difference (K,) to reconstruct now, or None to hold. limit: of the operator's score, which a scan's noise
-        exceeds with the probability CHANGED.
-        """
-        if self._reference is not None:
-            variance = 1 + 1 / self.averaged  # of the change, in units of one frame's
-            if operator.score(d - self._reference) > variance * limit:
-                self._recent.clear()
-                self._count = 0
-        self._recent.append(d)
-        self._count += 1
-        if self._reference is not None and not _due(self._count):
-            return None
-        self._reference = np.mean(self._recent, axis=0)
-        self.averaged = len(self._recent)
-        self.scan = scan
-        return self._reference
-
-    def state(self) -> dict[str, Any]:
-        return {
-            "reference": self._reference,
-            "averaged": self.averaged,
-            "recent": np.array(self._recent),
-            "count": self._count,
-            "scan": self.scan,
-            "live": None if self._live is None else self._live.astype(np.uint8),
-        }
-
-    def load(self, state: dict[str, Any], measurements: int) -> None:
-        """Raises KeyError, TypeError or ValueError where it does not fit."""
-        self.reset()
-        reference = state["reference"]
-        self._reference = None if reference is None else shaped(reference, (measurements,))
-        self.averaged, self._count, self.scan = int(state["averaged"]), int(state["count"]), int(state["scan"])
-        self._recent.extend(shaped(row, (measurements,)) for row in state["recent"])
-        if (live := state.get("live")) is not None:  # older recordings have none
-            self._live = shaped(live, (measurements,)) > 0
-        if self.scan < 0 or (self._reference is not None and self.averaged < 1):
-            raise ValueError(f"a hold of {self.averaged} frames since scan {self.scan}: expected 1 or more, from 0 on")
-
-
-def _due(count: int) -> bool:
-    return count in MEANS or count % LONGEST_MEAN == 0
-
-
 class Operators:
     """Of one skin. Each is made once, which takes 10 ms."""
 
     def __init__(self, pre: PreReconstructor, scale_per_s: float, contact_per_s: float) -> None:
         """How fast an untouched skin may change, relative: its conductivity, and each electrode's contact impedance."""
-        self._pre, self._drift = pre, Drift(scale_per_s * REST_S, contact_per_s * REST_S)
+        self._pre, self._drift = pre, Drift(scale_per_s * DRIFTS_S, contact_per_s * DRIFTS_S)
         self._made: dict[tuple[bytes, int, int], Operator] = {}
 
     def __call__(self, sigma: NDArray[np.float32], averaged: int, tare_frames: int) -> Operator | None:
@@ -146,27 +73,32 @@ class Reconstructed(NamedTuple):
 
 
 class Reconstruction:
-    """Of one skin, against one baseline."""
+    """Of one skin, against one baseline: which frames of a touch are reconstructed, and from what: those since it last
+    changed, by the whitened energy of an image's operator. The limit allows for the noise having been estimated from
+    few scans.
+
+    While nothing changes against the frame last reconstructed (not the previous frame: creep must be seen), frames are
+    averaged, and their mean is reconstructed after 2, 4, 8, 16, 32, 48 ... of them.
+    """
 
     def __init__(self, operators: Operators) -> None:
         self._operators = operators
-        self._averager = FrameAverager()
         self.begin(np.zeros(0), 0)
 
     def begin(self, sigma: Array, frames: int) -> None:
         """Another baseline, the mean of so many frames; sigma (K,): noise of the difference to it."""
         self.sigma, self.frames = sigma, frames
         self._limit: tuple[Operator, float] | None = None  # of a change's score, by this operator
-        self._averager.reset()
+        self.reset()
 
-    @property
-    def scan(self) -> int:
-        """Number of the scan last reconstructed; 0: none yet of this touch."""
-        return self._averager.scan
-
-    def rest(self) -> None:
+    def reset(self) -> None:
         """Nothing touches."""
-        self._averager.reset()
+        self._live: NDArray[np.bool_] | None = None  # measurements that count in the mean
+        self._reference: Array | None = None  # the difference last reconstructed
+        self._averaged = 0  # frames in it
+        self._recent: deque[Array] = deque(maxlen=LONGEST_MEAN)
+        self._count = 0  # frames since the last change
+        self.scan = 0  # number of the one last reconstructed; 0: none yet of this touch
 
     def __call__(self, d: Array, sigma: NDArray[np.float32], scan: int) -> Reconstructed | None:
         """Of a scan's difference and its standard deviation (K,), infinite where a measurement does not count. None:
@@ -174,13 +106,26 @@ class Reconstruction:
         """
         operator = self._operators(sigma, 1, self.frames)
         if operator is None:
-            self._averager.reset()
+            self.reset()
             return None
         if self._limit is None or self._limit[0] is not operator:
             self._limit = operator, operator.threshold(CHANGED, self.frames)
-        self._averager.of(np.isfinite(sigma))
-        mean = self._averager(d, scan, *self._limit)
-        return None if mean is None else Reconstructed(mean, self._averager.averaged)
+        live = np.isfinite(sigma)
+        if self._live is None or (live != self._live).any():  # frames of other measurements make another image
+            self.reset()
+        self._live = live
+        if self._reference is not None:
+            variance = 1 + 1 / self._averaged  # of the change, in units of one frame's
+            if operator.score(d - self._reference) > variance * self._limit[1]:
+                self._recent.clear()
+                self._count = 0
+        self._recent.append(d)
+        self._count += 1
+        if self._reference is not None and self._count not in MEANS and self._count % LONGEST_MEAN:
+            return None
+        self._reference = np.mean(self._recent, axis=0)
+        self._averaged, self.scan = len(self._recent), scan
+        return Reconstructed(self._reference, self._averaged)
 
     def prepare(self) -> bool:
         """Make the operator that the next touch needs first; False: it is there."""
@@ -190,8 +135,23 @@ class Reconstruction:
         return self._operators(sigma, 1, self.frames) is not None
 
     def state(self) -> dict[str, Any]:
-        return self._averager.state()
+        return {
+            "reference": self._reference,
+            "averaged": self._averaged,
+            "recent": np.array(self._recent),
+            "count": self._count,
+            "scan": self.scan,
+            "live": None if self._live is None else self._live.astype(np.uint8),
+        }
 
     def load(self, state: dict[str, Any]) -> None:
         """Raises KeyError, TypeError or ValueError where it does not fit."""
-        self._averager.load(state, len(self.sigma))
+        self.reset()
+        reference, shape = state["reference"], self.sigma.shape
+        self._reference = None if reference is None else shaped(reference, shape)
+        self._averaged, self._count, self.scan = int(state["averaged"]), int(state["count"]), int(state["scan"])
+        self._recent.extend(shaped(row, shape) for row in state["recent"])
+        if (live := state.get("live")) is not None:  # older recordings have none
+            self._live = shaped(live, shape) > 0
+        if self.scan < 0 or (self._reference is not None and self._averaged < 1):
+            raise ValueError(f"a hold of {self._averaged} frames since scan {self.scan}: expected 1 or more, from 0 on")
