@@ -56,7 +56,7 @@ def turned(frames: Iterable[JudgementsFrame]) -> dict[str, str]:
 
 def _numbers(each: Judgement) -> str:
     """Statistic, limit and ratio; which electrode or touch it is about."""
-    of = "electrode" if ROWS.get(each.name, UNKNOWN).room.startswith("faults") else "touch"
+    of = "electrode" if ROWS.get(each.name, UNKNOWN).file.startswith("faults") else "touch"
     place = f", {of} {each.where}" if each.where >= 0 else ""
     found, limit, ratio = (_short(value) for value in (each.statistic, each.expected, each.ratio))
     return f"{found}, limit {limit}, ratio {ratio}{place}"

@@ -1,1 +1,1 @@
-"""What passes between the estimator's rooms: scans, judgements, estimates. Frozen; nothing here decides."""
+"""What passes between the estimator's parts: scans, judgements, estimates. Frozen; nothing here decides."""

@@ -59,8 +59,7 @@ class Estimate:
 
     @cached_property
     def reasons(self) -> tuple[str, ...]:
-        said = judgement.reasons(self.judgements)
-        return tuple(dict.fromkeys([*self.scan.reasons, *said]))
+        return tuple(dict.fromkeys([*self.scan.reasons, *judgement.reasons(self.judgements)]))
 
     @cached_property
     def touch(self) -> Judgement | None:

@@ -36,11 +36,11 @@ class Judgement(NamedTuple):
 
 @dataclass(frozen=True)
 class CheckRow:
-    """One check of the table. room: the file that judges it; reason: what a frame says where it turned, or ""."""
+    """One check of the table."""
 
-    room: str
+    file: str  # of services/estimation, that judges it
     turned: Verdict
-    reason: str = ""
+    reason: str = ""  # that a frame says where it turned
 
 
 NOTE, REFUSE = Verdict.NOTE, Verdict.REFUSE
@@ -60,12 +60,12 @@ ROWS: Mapping[str, CheckRow] = {
     "too_many": CheckRow("faults/advice", REFUSE),  # what is wrong with each of them is said
     "gap": CheckRow("estimator", REFUSE, "gap"),
     "seen": CheckRow("estimator", REFUSE, "degraded"),
-    "baseline": CheckRow("first/tare", REFUSE, "stale_baseline"),
-    "agrees": CheckRow("first/tare", REFUSE, "stale_baseline"),
-    "noise_trained": CheckRow("first/tare", REFUSE, "stale_baseline"),
-    "identical": CheckRow("first/tare", REFUSE, "stale_baseline"),
-    "hidden": CheckRow("first/start", REFUSE, "stale_baseline"),
-    "start": CheckRow("first/start", REFUSE, "touched_at_start"),
+    "baseline": CheckRow("initialisation/tare", REFUSE, "stale_baseline"),
+    "agrees": CheckRow("initialisation/tare", REFUSE, "stale_baseline"),
+    "noise_trained": CheckRow("initialisation/tare", REFUSE, "stale_baseline"),
+    "identical": CheckRow("initialisation/tare", REFUSE, "stale_baseline"),
+    "hidden": CheckRow("initialisation/start", REFUSE, "stale_baseline"),
+    "start": CheckRow("initialisation/start", REFUSE, "touched_at_start"),
     "touch": CheckRow("estimator", NOTE),  # it says that something touches
     "explained": CheckRow("estimator", REFUSE, "out_of_distribution"),
     "changing": CheckRow("estimator", NOTE, "changing"),
@@ -90,6 +90,5 @@ def valid(judgements: Iterable[Judgement]) -> bool:
 
 def reasons(judgements: Iterable[Judgement]) -> list[str]:
     """What a frame with these judgements says, in the table's order, each once."""
-    spoken = {each.name for each in judgements if each.verdict in (Verdict.NOTE, Verdict.REFUSE)}
-    said = [row.reason for name, row in ROWS.items() if name in spoken and row.reason]
-    return list(dict.fromkeys(said))
+    turned = {each.name for each in judgements if each.verdict in (Verdict.NOTE, Verdict.REFUSE)}
+    return list(dict.fromkeys(row.reason for name, row in ROWS.items() if name in turned and row.reason))

@@ -56,8 +56,9 @@ class Scan:
         end_us = frame.device_us + 1e6 * newest_s
         sample_ns = frame.stamps.get("sample", 0)
         valid, reasons = as_sent(frame)  # measurements that failed are left out
-        follows = before is not None and before.board == frame.board and end_us > before.end_us
-        new = end_us - 1e6 * ages_s > before.end_us if before is not None and follows else np.ones(count, bool)
+        new = np.ones(count, bool)
+        if before is not None and before.board == frame.board and end_us > before.end_us:
+            new = end_us - 1e6 * ages_s > before.end_us
         return cls(
             values=np.abs(frame.z.astype(np.complex128)),
             ages_s=ages_s,
@@ -86,7 +87,8 @@ def _spanned_s(ages_s: Array) -> float:
 
 def _duration_s(frame: RawFrame, before: Scan | None) -> float:
     """Of a whole scan: what passed since the one before it, as boards measure one after the other."""
-    if before is None or before.part or frame.scan != before.number + 1:
-        return SCAN_S if before is None or before.part else before.duration_s
+    if before is None or before.part:
+        return SCAN_S
     passed_s = (frame.device_us - before.end_us) * 1e-6 + before.duration_s
-    return passed_s if SHORTEST_S < passed_s < LONGEST_S else before.duration_s
+    follows = frame.scan == before.number + 1 and SHORTEST_S < passed_s < LONGEST_S
+    return passed_s if follows else before.duration_s

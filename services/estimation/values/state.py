@@ -75,15 +75,9 @@ def _record(kind: Any, found: Any, sizes: Sizes, where: str) -> Any:
     if is_dataclass(kind):
         if not isinstance(found, dict) or found.keys() != hints.keys():
             raise _misfit(where, found, f"a map of {', '.join(hints)}")
-        values = [found[name] for name in hints]
     else:
-        values = _list(found, where)
-        if len(values) != len(hints):
-            raise _misfit(where, found, f"{len(hints)} values")
-    read = [
-        _read(hint, value, sizes, f"{where}.{name}") for (name, hint), value in zip(hints.items(), values, strict=True)
-    ]
-    return kind(*read)
+        found = dict(zip(hints, _list(found, where, len(hints)), strict=True))
+    return kind(*(_read(hint, found[name], sizes, f"{where}.{name}") for name, hint in hints.items()))
 
 
 @cache
@@ -94,22 +88,20 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def _several(origin: Any, arguments: tuple[Any, ...], found: Any, sizes: Sizes, where: str) -> Any:
-    values = _list(found, where)
     if origin is dict:
-        pairs = [_list(each, where) for each in values]
-        if any(len(pair) != 2 for pair in pairs):
-            raise _misfit(where, found, "pairs of key and value")
+        pairs = [_list(each, where, 2) for each in _list(found, where)]
         return {_read(arguments[0], k, sizes, where): _read(arguments[1], v, sizes, f"{where}[{k}]") for k, v in pairs}
     if origin is list or arguments[-1] is Ellipsis:
-        return origin(_read(arguments[0], each, sizes, f"{where}[{n}]") for n, each in enumerate(values))
-    if len(values) != len(arguments):
-        raise _misfit(where, found, f"{len(arguments)} values")
-    return tuple(_read(kind, each, sizes, where) for kind, each in zip(arguments, values, strict=True))
+        each = enumerate(_list(found, where))
+        return origin(_read(arguments[0], value, sizes, f"{where}[{k}]") for k, value in each)
+    values = _list(found, where, len(arguments))
+    return tuple(_read(kind, value, sizes, where) for kind, value in zip(arguments, values, strict=True))
 
 
-def _list(found: Any, where: str) -> list[Any]:
-    if not isinstance(found, list):
-        raise _misfit(where, found, "a list")
+def _list(found: Any, where: str, count: int | None = None) -> list[Any]:
+    """Of so many values; None: of any number."""
+    if not isinstance(found, list) or count not in (None, len(found)):
+        raise _misfit(where, found, "a list" if count is None else f"a list of {count}")
     return found
 
 
