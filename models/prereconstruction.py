@@ -25,6 +25,7 @@ Array = npt.NDArray[np.floating]
 ONE_STEP_LAMBDA = 0.15  # the paper's, section II; relative to the mean eigenvalue of the whitened Gram matrix
 THRESHOLD_T = 0.35  # t of equation 5; the paper chose it by trial and does not state it, and so did we
 TARE_FRAMES = 64
+SHARED = 32  # frames that the noise of all measurements counts as beside each one's own
 OUTLIER = 16.0  # times the median: variances beyond it do not raise the level of the others (a converter's stay below)
 MODEL_ERROR = 2e-6
 """What the forward model gets wrong of d under a light touch, a drop of 0.1 S/m. Measured, training mesh against
@@ -253,10 +254,15 @@ def noise_of_frames(frames: Array, z0: Array) -> Array:
     """(K,) sigma of |Z| [unit of frames] from (N, K) untouched |Z|: per channel, shrunk towards noise proportional to
     |Z0|.
 
-    With N frames a channel's own estimate is uncertain by 1 / sqrt(2 N); the shrinkage gives the pooled relative
-    level the weight of 32 frames, which keeps one channel's lucky tare from being trusted too much.
+    With N frames a channel's own estimate is uncertain by 1 / sqrt(2 N); the shrinkage keeps one channel's lucky tare
+    from being trusted too much.
     """
     own = frames.var(axis=0, ddof=1)
-    pooled = np.median(own / z0**2) * z0**2
-    n = len(frames)
-    return np.asarray(np.sqrt((n * own + 32 * pooled) / (n + 32)))
+    return np.asarray(np.sqrt(shrunk(own, np.median(own / z0**2) * z0**2, len(frames))))
+
+
+def shrunk(own: Array, pooled: Array | float, frames: int) -> Array:
+    """(K,) variances that so many frames tell of each measurement, shrunk towards that of all, which counts as much as
+    SHARED frames do.
+    """
+    return np.asarray((frames * own + SHARED * pooled) / (frames + SHARED))

@@ -105,7 +105,7 @@ def _mean_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None]) 
         frames = frames[:1]
     if len(frames) >= FEWEST_FOR_TARE:
         try:
-            return take(frames, pre, "file", 0, np.inf)
+            return take(frames, pre, "file", np.inf)
         except NoBaseline as why:
             doubt = f"`untouched`: {why}"
             warn(doubt + "; using their mean")

@@ -33,7 +33,7 @@ class Skinny:
         self.z0, self.noise, self.rng, self.scan = z0, 10 ** (-decibel / 20), np.random.default_rng(5), 0
         self.pipeline = Pipeline(skin, bundle=bundle, always_reconstruct=not hold, each_alone=not hold)
         tare = z0 * (1 + self.noise * self.rng.standard_normal((64, len(z0))))
-        self.baseline = take(tare, self.pipeline.pre.pre, "b", 0)
+        self.baseline = take(tare, self.pipeline.pre.pre, "b")
         self.release()
 
     def release(self) -> None:

@@ -58,7 +58,7 @@ class Stages:
         self.pipeline, self.scan = Pipeline(Skin(port="stub", bundle="square16", network="full")), 0
 
     def tare(self, z0):
-        return take(noisy(z0, np.random.default_rng(0), 64), self.pipeline.pre.pre, "bench", 0)
+        return take(noisy(z0, np.random.default_rng(0), 64), self.pipeline.pre.pre, "bench")
 
     def begin(self, baseline):
         """Forget everything; this baseline from now on."""
@@ -123,7 +123,7 @@ def test_frames_that_no_skin_made_are_never_valid_nor_anything_against_a_tare_of
         z, status = made(family, rng)
         frames = np.abs(z) * (1 + 1e-4 * rng.standard_normal((64, 120)))
         try:
-            of_it = take(frames, stages.pipeline.pre.pre, "bench", 0)
+            of_it = take(frames, stages.pipeline.pre.pre, "bench")
         except NoBaseline:
             return
     assert not stages.once(of_it, frames[0], status).valid

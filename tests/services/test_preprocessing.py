@@ -365,18 +365,18 @@ def test_recordings_and_their_reference_frames(tared: Fed, board: Board) -> None
 def test_noise_of_a_baseline(bundle: Bundle) -> None:
     """Identical frames tell none: without noise of its own a skin would be touched by anything."""
     z, pre, rng = np.asarray(bundle.z0, float), bundle.prereconstructor(), np.random.default_rng(0)
-    same = take(np.tile(z, (64, 1)), pre, "b1", 0)
+    same = take(np.tile(z, (64, 1)), pre, "b1")
     assert "identical" in same.doubt and same.sigma == pytest.approx(1e-3 * z)
     for relative in (1e-9, 1e-4):
         frames = z * (1 + relative * rng.standard_normal((64, len(z))))
         frames[5, 3] = np.nan
-        found = take(frames, pre, "b1", 0)
+        found = take(frames, pre, "b1")
         assert not found.doubt and np.flatnonzero(~np.isfinite(found.sigma)).tolist() == [3]
         assert np.median(found.sigma / z) == pytest.approx(max(relative, 2e-6), rel=0.1)
     with pytest.raises(NoBaseline, match="scatter"):
-        take(z * (1 + 0.2 * rng.standard_normal((64, 120))), pre, "", 0)
+        take(z * (1 + 0.2 * rng.standard_normal((64, 120))), pre, "")
     with pytest.raises(NoBaseline, match="measurements give values"):
-        take(np.where(np.arange(120) < 70, np.nan, z * np.ones((64, 120))), pre, "", 0)
+        take(np.where(np.arange(120) < 70, np.nan, z * np.ones((64, 120))), pre, "")
 
 
 def test_a_skin_that_warms_is_tared_and_one_that_is_pressed_slowly_is_not(bundle: Bundle) -> None:

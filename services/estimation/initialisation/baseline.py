@@ -82,7 +82,7 @@ class Baseline:
         return cls(z0, sigma, *rest, *provenance, noise_frames)
 
 
-def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int, most_misfit: float = IMPLAUSIBLE) -> Baseline:
+def take(frames: Array, pre: PreReconstructor, board: str, most_misfit: float = IMPLAUSIBLE) -> Baseline:
     """The baseline of (N, K) |Z|. Raises NoBaseline where the frames do not agree with each other.
 
     A measurement that is not finite in every frame gets an infinite sigma: it is left out until the next tare.
@@ -102,7 +102,7 @@ def take(frames: Array, pre: PreReconstructor, board: str, taken_ns: int, most_m
         doubt = untrained(share)
     if off := implausible(z0, sigma / len(frames) ** 0.5, pre, most_misfit):
         doubt = f"the baseline is {off}: free the skin and run `skin tare`"
-    return Baseline(z0, sigma, len(frames), board, taken_ns, doubt)
+    return Baseline(z0, sigma, len(frames), board, 0, doubt)
 
 
 def measured(log_z: Array) -> tuple[NDArray[np.bool_], float]:
@@ -196,7 +196,8 @@ def agreement(scans: Array) -> Agreement:
     dof_within = quarters * (size - 1)
     dof = (quarters - 1) * scans.shape[1]
     quantile = NormalDist().inv_cdf(1 - numbers.TARE_DISAGREES)
-    chi_square = dof * (1 - 2 / (9 * dof) + quantile * (2 / (9 * dof)) ** 0.5) ** 3  # Wilson-Hilferty
+    spread = 2 / (9 * dof)
+    chi_square = dof * (1 - spread + quantile * spread**0.5) ** 3  # Wilson-Hilferty
     estimated = dof_within / (dof_within - 2) * (1 + 2 / dof_within)  # the noise within is estimated too
     return Agreement(statistic, float(chi_square * estimated))
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.prereconstruction import PreReconstructor
+from models.prereconstruction import PreReconstructor, shrunk
 from services.estimation.initialisation.baseline import LEAST_NOISE, SEE, UNLIKE, Baseline, implausible
 from services.estimation.values import numbers
 from services.estimation.values.state import shaped
@@ -20,7 +20,6 @@ Array = NDArray[np.float64]
 
 MOST_ROWS = 1024  # of which noise is found: time and memory go with their square
 NEIGHBOURS = 2  # scans that each is compared with: more are less alike, one alone tells less
-SHARED = 32  # rows that the noise of all measurements counts as beside each one's own, as in noise_of_frames
 
 
 class References:
@@ -47,8 +46,7 @@ class References:
         """The baseline that this scan's |Z| (K,) is, NaN where a measurement failed; None where half of it did. It is
         in doubt where `pre` predicts another skin.
         """
-        good = np.isfinite(amplitude) & (amplitude > 0)
-        self.scan = scan
+        self.scan, good = scan, np.isfinite(amplitude) & (amplitude > 0)
         if good.sum() < self._k / 2:
             return None
         self._row.append(np.where(good, amplitude, np.nan))
@@ -130,7 +128,7 @@ def _noise(reference: Array) -> Array:
     if not np.isfinite(typical):
         return np.full(k, numbers.TARE_ASSUMED)
     own = np.where(np.isfinite(own), own, typical)
-    return np.asarray(np.maximum(np.sqrt((n * own**2 + SHARED * typical**2) / (n + SHARED)), LEAST_NOISE))
+    return np.asarray(np.maximum(np.sqrt(shrunk(own**2, typical**2, n)), LEAST_NOISE))
 
 
 def _nearest(points: Array, count: int) -> NDArray[np.intp]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.responses.tables import FIELD_DEGREES, SkinTables
+from models.prereconstruction import shrunk
 from services.estimation.faults.wires import WireFault, WireKind
 from services.estimation.initialisation.baseline import (
     LEAST_NOISE,
@@ -34,7 +35,6 @@ from services.estimation.values.scan import Scan
 
 Array = NDArray[np.float64]
 
-SHARED = 32  # scans that the scatter of all measurements counts as beside each one's own
 WIRED_AFTER = 2  # scans, after which wires are asked first; then every TARE_RETRIES
 
 UNSURE = (
@@ -67,10 +67,9 @@ class AgreedScans(NamedTuple):
     def scatter(self) -> Array:
         """(K,) standard deviation from scan to scan: each measurement's own and that of all, as few scans tell it."""
         own = self.residuals.var(axis=0, ddof=1)
-        n_own = len(self.residuals)
-        together = float(np.median(own[self.live])) if self.live.any() else 0.0
-        shrunk = (n_own * own + SHARED * together) / (n_own + SHARED)
-        return np.asarray(np.sqrt(np.maximum(shrunk, max(self.least_white, LEAST_NOISE**2))))
+        pooled = float(np.median(own[self.live])) if self.live.any() else 0.0
+        variance = shrunk(own, pooled, len(self.residuals))
+        return np.asarray(np.sqrt(np.maximum(variance, max(self.least_white, LEAST_NOISE**2))))
 
 
 @dataclass
@@ -133,9 +132,8 @@ class LatestScans:
         """Raises NoBaseline where there are too few, or they do not agree. order (K,): the value that each measurement
         would show if no wires were exchanged; None: its own.
         """
-        needed = self.needed
-        if len(self) < needed:
-            raise NoBaseline(f"only {len(self)} of {needed} frames came so far: wait, or look at `skin top`")
+        if len(self) < self.needed:
+            raise NoBaseline(f"only {len(self)} of {self.needed} frames came so far: wait, or look at `skin top`")
         scans = np.stack(self.now.log_z)
         scans = scans if order is None else scans[:, order]
         live, noise = measured(scans)
@@ -146,17 +144,7 @@ class LatestScans:
         judgements = [judge("agrees", *found), judge("identical", n.TARE_IDENTICAL, max(noise, 1e-300))]
         if tables.predicted:  # a measured bundle knows its own noise
             judgements.append(judge("noise_trained", noise, n.TARE_UNTRAINED))
-        white = n.TARE_ASSUMED**2 if noise < n.TARE_IDENTICAL else 0.0
-        return self._made(scans, live, tables, float(white), tuple(judgements))
-
-    def _made(
-        self,
-        scans: Array,
-        live: NDArray[np.bool_],
-        tables: SkinTables,
-        white: float,
-        judgements: tuple[Judgement, ...],
-    ) -> AgreedScans:
+        white = float(n.TARE_ASSUMED**2) if noise < n.TARE_IDENTICAL else 0.0
         mean = np.where(live, scans, 0.0).mean(axis=0)
         predicted = np.log(tables.z0)
         log_z0 = np.where(live, mean, predicted + float(np.median((mean - predicted)[live])))
@@ -164,7 +152,7 @@ class LatestScans:
         off = np.where(live, scans - log_z0, 0.0)
         residuals = off - slope[:, None] * (slope @ off / (slope @ slope))
         at_s, parts = float(np.mean(self.now.at_s)), tuple(self.now.parts)
-        return AgreedScans(log_z0, live, residuals, at_s, parts, white, judgements)
+        return AgreedScans(log_z0, live, residuals, at_s, parts, white, tuple(judgements))
 
 
 def without_drift(scans: Array, field: Array) -> Array:
@@ -273,22 +261,19 @@ class Taring:
 
     def judgements(self, tared: bool) -> list[Judgement]:
         """Rows of every scan; tared: whether there is a baseline."""
-        touched = any(each.name == "start" and each.ratio >= 1 for each in self.now.judgements)
         rows = list(self.now.judgements)
-        if not tared and not touched:
+        if not tared and not any(each.name == "start" and each.ratio >= 1 for each in rows):
             rows.insert(0, judge("baseline", self.latest.needed, max(len(self.latest), 1)))
         return rows
 
     def _taken(self, scans: AgreedScans, start: JudgedStart | None) -> None:
         now = self.now
-        now.surely, now.untouched, now.touched = False, 0, False
-        turned = {each.name for each in now.judgements if each.ratio >= 1}
+        now.surely, now.untouched, now.touched, now.problem = False, 0, False, ""
+        turned = {each.name: each.statistic for each in now.judgements if each.ratio >= 1}
         now.doubted = bool(turned)
-        now.problem = ""
-        if "identical" in turned:
-            now.problem = identical(len(scans.residuals))
         if "noise_trained" in turned:
-            noise = next(each.statistic for each in now.judgements if each.name == "noise_trained")
-            now.problem = untrained(noise)
-        elif not now.problem and start is not None and start.says is StartSays.UNKNOWN:
+            now.problem = untrained(turned["noise_trained"])
+        elif "identical" in turned:
+            now.problem = identical(len(scans.residuals))
+        elif start is not None and start.says is StartSays.UNKNOWN:
             now.problem = UNSURE
