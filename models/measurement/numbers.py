@@ -31,9 +31,7 @@ CONTACT_START = Number(1e-3, "-", "a contact impedance in a frame of the tare", 
 
 MISFIT = Number(0.004, "-", "what the linear disc leaves of a touch's change", "measured: 0.05 to 0.6 % on both meshes")
 MISFIT_WIDE = Number(0.03, "-", "the same near electrodes and at deep touches", "measured: 3.4 % at most")
-MISFIT_FAR = Number(
-    0.015, "-", "MISFIT of coarse tables, or where others sense than drive", "measured: 0.2 to 1.5 %, near electrodes 4"
-)
+MISFIT_FAR = Number(0.015, "-", "MISFIT of coarse tables, or sensed elsewhere than driven", "measured: 0.2 to 1.5 %")
 MISFIT_POWER = Number(0.3, "-", "of the Gram matrix: colour of that misfit", "measured: as the bundles' own misfit")
 """How wrong a response is."""
 
@@ -62,27 +60,19 @@ TENSOR_SD = Number(0.15, "-", "drop along a touch less that across", "measured: 
 DAMPING = Number(1e-3, "-", "of the first step, Levenberg's", "chosen: any small one")
 DONE = Number(0.5, "nat", "a step that gains less ends the search", "derived: a tenth of what decides between two")
 DONE_SHARE = Number(3e-3, "-", "the same of what is left", "derived: of 120, as DONE")
-LINEAR = Number(
-    0.05, "-", "of radius and action: a step within which slopes hold", "derived: its square, 0.25 %, is below MISFIT"
-)
+LINEAR = Number(0.05, "-", "of radius and action: a step within which slopes hold", "derived: squared, below MISFIT")
 LEAST_STEP = Number(0.06, "unit", "that a touch moves in one step at least", "derived: 1.5 pixels")
 STEP_SHARE = Number(0.6, "-", "of a radius that one step moves a touch at most", "chosen: the disc still overlaps")
 STEP_LOG = Number(0.5, "-", "of log radius in one step at most", "chosen: the disc still overlaps")
 MOVES = Number(0.02, "unit", "way within a scan from which on a touch's motion bends", "derived: half a pixel")
 TURNS = Number(0.02, "unit", "way after which a touch's own directions are taken anew", "derived: half a pixel")
 TURNS_LOG = Number(0.1, "-", "the same of log radius", "derived: a tenth of them")
-SUDDEN_S = Number(
-    0.002, "s", "steps of the course of a touch that begins or ends at once", "derived: half a part of a scan"
-)
+SUDDEN_S = Number(0.002, "s", "steps of the course of a touch that begins or ends at once", "derived: half a part")
 SUDDEN_SD = Number(0.5, "-", "of its action, by which each step may differ", "derived: from none to all")
 SUDDEN_JITTER = Number(0.1, "-", "of its action, within such a step", "derived: a kink in the middle of one")
-STEADY = Number(
-    0.05, "-", "of its action, by which one that ended at once changed before", "derived: foam creeps by 5 %"
-)
+STEADY = Number(0.05, "-", "of its action, by which one that ended at once changed before", "derived: foam creeps so")
 COURSE_S = Number(0.0044, "s", "steps of the course of a touch that changes", "derived: a part of a scan")
-COURSE_SD = Number(
-    0.3, "-", "of its change, by which each may differ", "derived: a ramp that ends half way is 0.25 off"
-)
+COURSE_SD = Number(0.3, "-", "of its change, by which each may differ", "derived: a ramp that ends half way: 0.25 off")
 COURSE_JITTER = Number(0.03, "-", "of its action, within such a step", "derived: ramps of 20 ms and more")
 BENDS_BY = Number(0.15, "-", "and of its radius", "derived: its square over 8 is 0.3 %, below MISFIT")
 KINK = Number(0.8, "-", "of a change within a scan: what of it may be no straight line", "derived: a ramp's half")
@@ -97,9 +87,7 @@ LEARNING_WHITE = Number(0.03, "-", "the same of the white noise", "derived: as L
 LEARNING_LINES = Number(0.005, "-", "the same of what they have in common", "derived: 200 scans, more than it has rows")
 LINE = Number(1.3, "-", "times what chance makes of white noise, from which on it is a line", "derived: Tracy-Widom")
 LINES = Number(6.0, "-", "eigenvectors of lines at most", "chosen: three frequencies")
-ALTERNATES = Number(
-    4.0, "-", "times what alternates from scan to scan, that a line has at most", "derived: beats of 9 scans or less"
-)
+ALTERNATES = Number(4.0, "-", "times what alternates from scan to scan, of a line at most", "derived: beats of 9")
 LEFT_OUT = Number(1e4, "-", "variance of a measurement that does not count", "derived: nothing is as large")
 OUTLIER = Number(9.0, "-", "squared sigmas beyond which a residual counts no further", "derived: 3 sigmas")
 """What noise is."""

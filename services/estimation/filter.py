@@ -289,7 +289,7 @@ class SkinFilter:
         for place in reversed(range(len(now.memories))):
             memory, own = now.memories[place], self._own(place)
             share, variance = float(now.x[own].sum()), max(0.0, float(now.p[own, own].sum()))
-            size = float(np.linalg.norm(memory.column)) / n.MEMORY_UNIT * np.sqrt(max(share**2, variance))
+            size = float(np.linalg.norm(memory.column)) / n.WHITE * np.sqrt(max(share**2, variance))
             if size >= n.MEMORY_FAINT and place >= len(now.memories) - n.MEMORIES:
                 continue
             now.remainder = now.remainder + memory.column * share

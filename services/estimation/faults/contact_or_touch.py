@@ -64,7 +64,7 @@ class ContactOrTouchTest:
         odds = contact.score - touch.score
         if odds > n.CONTACT_TOLD:
             doubt.end(faults.size)
-        elif odds < -n.TOUCH_TOLD and touch.explained:
+        elif odds < -n.FAULT_SURE and touch.explained:
             return touch.fit
         return None
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START, Number
+from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START, WHITE, Number
 
-__all__ = ["CONTACT_START", "FALSE_ALARM_Z2", "FIELD_START"]  # beside this module's own
+__all__ = ["CONTACT_START", "FALSE_ALARM_Z2", "FIELD_START", "WHITE"]  # beside this module's own
 
 GLANCE_Z2 = Number(36.0, "-", "the same at a first look", "derived: the whitening is 0.5 s old, 10 % of z")
 GLANCE_S = Number(0.5, "s", "for which a whitening does for a first look", "derived: drift beyond is 1e-5")
@@ -14,9 +14,7 @@ GOOD = Number(1.45, "-", "the same of a fit that explains its scan", "derived: 3
 MOST = Number(2.5, "-", "the same of a fit that is roughly right: places hold", "chosen: 60 % more than the noise")
 """Is something there, and is it explained?"""
 
-FIELD_WALK = Number(
-    1e-5, "1/sqrt(s)", "log conductivity, even: its own walk", "measured: drift of 4 %/min, 459 phantoms"
-)
+FIELD_WALK = Number(1e-5, "1/sqrt(s)", "log conductivity, even: its walk", "measured: drift of 4 %/min, 459 phantoms")
 SLOPE_WALK = Number(3e-6, "1/sqrt(s)", "the same across the sheet", "derived: a third of FIELD_WALK")
 FIELD_RATE = Number(2e-4, "1/s", "log conductivity, even: its rate at the tare", "derived: half a degree a minute")
 SLOPE_RATE = Number(1e-4, "1/s", "the same across the sheet", "derived: half of FIELD_RATE")
@@ -39,33 +37,22 @@ MEMORY_FADES_S = (
     Number(2.0, "s", "fast time constant of foam's recovery", "measured: needed to a factor of 4 only"),
     Number(40.0, "s", "slow one", "measured: needed to a factor of 4 only"),
 )
-MEMORY_SHARE = Number(
-    0.01, "-", "of a touch that stays at first, each state", "measured: 1 to 8 % (van der Schuur 2004)"
-)
+MEMORY_SHARE = Number(0.01, "-", "of a touch that stays, each state", "measured: 1 to 8 % (van der Schuur 2004)")
 MEMORY_SD = Number(0.012, "-", "its standard deviation", "derived: of that range")
 MEMORY_WALK = Number(0.5, "-", "of itself in a time constant", "chosen: no foam is exponential")
 MEMORY_MOST = Number(0.05, "-", "share above which it is a touch, not memory", "chosen: the promise, below 1 to 8 %")
 MEMORY_SIGMAS = Number(3.0, "-", "sigmas above that share", "derived: one in a thousand")
 MEMORY_DOUBT_S = Number(3.0, "s", "after which a memory is not doubted any more", "derived: beyond the fast recovery")
-MEMORY_UNIT = Number(1e-4, "-", "noise that a memory is held against", "data sheet: AD5940, 80 dB")
-MEMORY_FAINT = Number(0.5, "-", "of that noise: less is forgotten", "derived: half a sigma of a whole scan")
+MEMORY_FAINT = Number(0.5, "-", "of WHITE: a fainter memory is forgotten", "derived: half a sigma of a whole scan")
 REFUSED_MOST = Number(0.5, "-", "change of |Z| that a touch makes at most", "derived: a drop of 1 under an electrode")
 MEMORIES = Number(12.0, "-", "memories that are kept", "chosen: cost; more were never alive at once")
 """What foam remembers."""
 
-MEMORY_APART = Number(
-    0.7, "-", "of a radius that a touch slides, until the place it left remembers by itself", "chosen: half its area"
-)
-PLACE_MOVES = Number(
-    0.08, "unit", "by which a place differs from where it was expected", "derived: 4 mm, 0.3 m/s for 13 ms"
-)
-SAME_TOUCH = Number(
-    0.15, "unit", "within which a touch that is found anew is the one before", "derived: 0.3 m/s, a scan"
-)
+MEMORY_APART = Number(0.7, "-", "of a radius: a place left by more remembers by itself", "chosen: half its area")
+PLACE_MOVES = Number(0.08, "unit", "by which a place differs from the one expected", "derived: 4 mm, 0.3 m/s for 13 ms")
+SAME_TOUCH = Number(0.15, "unit", "within which a touch found anew is the one before", "derived: 0.3 m/s, a scan")
 BENDS = Number(0.13, "-", "of a change within a scan: error of its middle where it bent", "derived: KINK / 2 / 3")
-ROUGH = Number(
-    0.1, "unit", "place of a touch that changed so that nothing explains it", "derived: 5 mm in a scan, 0.1 m/s"
-)
+ROUGH = Number(0.1, "unit", "place of a touch that changed and is not explained", "derived: 5 mm in a scan, 0.1 m/s")
 STILL_SCANS = Number(3.0, "-", "scans without motion or change, after which a touch stays", "derived: of one in 1000")
 PLACE_WALK = Number(0.003, "unit", "place of one that stays, from scan to scan", "derived: a third of STILL_WAY")
 STAYS_WITHIN = Number(2.5, "-", "sigmas that one which stays is off at most", "derived: one scan of 25")
@@ -75,7 +62,7 @@ RADIUS_WALK = Number(0.05, "-", "log radius from scan to scan", "chosen: a finge
 SHAPE_WALK = Number(0.3, "-", "of what shapes differ by, from scan to scan", "chosen: a finger that rolls")
 SLIDES = Number(1.5, "unit/s", "velocity of a touch of which nothing is known", "derived: 75 mm/s, one sigma")
 TURNS = Number(1.0, "unit/s/sqrt(s)", "its walk", "chosen: one that slides turns round in half a second")
-ACTION_WALK = Number(0.05, "-", "of its action, from scan to scan, as it meets another", "chosen: as RADIUS_WALK")
+ACTION_WALK = Number(0.05, "-", "of its action, from scan to scan, as it meets another", "derived: as RADIUS_WALK")
 MEET_S = Number(2.0, "s", "for which two are kept apart by what they were", "chosen: a second or two of crossing")
 GOES = Number(0.7, "-", "of its action, below which a touch is going", "chosen: above any relaxation")
 ENDED = Number(0.05, "-", "of its greatest action, below which it has ended", "derived: MEMORY_MOST")
@@ -89,22 +76,16 @@ ONSET_Z2 = Number(7.0, "-", "z^2 that a touch which began within a scan must hav
 ANOTHER = Number(15.0, "nat", "evidence that a further touch adds in a part", "derived: 650 discs in 1e4 frames, and 2")
 RECOUNT_GAIN = Number(5.0, "nat", "evidence of others than those that stand", "derived: one false in 150 askings")
 ANOTHER_Z2 = Number(16.0, "-", "z^2 of a further disc that is tried by evidence", "chosen: 4 sigmas; evidence decides")
-WIDE_START = Number(
-    4.1, "nat", "log prior that a new touch's wide start lacks", "derived: places 1.9 (sheet), actions 2.2 (1 to 100)"
-)
+WIDE_START = Number(4.1, "nat", "log prior that a new touch's wide start lacks", "derived: places 1.9, actions 2.2")
 LOG_PRIOR_TOUCH = Number(-3.5, "nat", "log prior of a touch that begins in a scan", "derived: one in 30 scans")
 LOG_PRIOR_DRIFT = Number(-7.0, "nat", "of faster drift", "derived: one in 1000 scans")
-LOG_PRIOR_MEMORY = Number(
-    -1.0, "nat", "of memories as large as foam's may be", "derived: one touch in three leaves more"
-)
+LOG_PRIOR_MEMORY = Number(-1.0, "nat", "of memories as large as foam's may be", "derived: one touch in three")
 LOG_PRIOR_BURST = Number(-3.0, "nat", "of a known disturbance that grew", "derived: one in 20 scans")
 LOG_PRIOR_NOISE = Number(-20.0, "nat", "of blocks with a noise of their own", "derived: 2 nats for each of ten figures")
 LOG_PRIOR_WIDE = Number(-2.0, "nat", "of a response that is wrong by MISFIT_WIDE", "derived: one touch in 7")
 BURST = Number(8.0, "-", "times a known disturbance's strength", "chosen: a drive that switches on is 10 times")
 MOST_NOISE = Number(4e-3, "-", "noise of a block under which a touch would still be seen", "derived: 1 N changes 1e-2")
-NEIGHBOURS = Number(
-    0.06, "unit", "gap below which two discs may be one touch", "derived: 3 mm, no nearer are told apart"
-)
+NEIGHBOURS = Number(0.06, "unit", "gap below which two discs may be one touch", "derived: 3 mm, none nearer are told")
 MOST_TOUCHES = Number(4.0, "-", "touches at once", "chosen: cost; image and contact frames hold more")
 MOST_STEPS = Number(200.0, "-", "steps times touches of one scan, beyond which nothing new is asked", "chosen: 30 ms")
 LEAST_BUDGET = Number(0.4, "-", "of them, for a part of a scan", "chosen: the parts after it are asked as well")
@@ -113,9 +94,7 @@ FOR_FAULTS = Number(0.4, "-", "of them, for what the board may have done", "deri
 STEPS_WARM = Number(4.0, "-", "steps of a fit from the scan before", "measured: 2 or 3 are used")
 STEPS_HELD = Number(1.0, "-", "the same of touches that stay as they are", "measured: seldom one is needed")
 STEPS_COLD = Number(10.0, "-", "steps of a fit from a grid's disc", "measured: 4 to 10 are used")
-ADRIFT = Number(
-    1.5, "-", "by which faster drift grows with each scan that nothing explains", "derived: 2 s to a per cent"
-)
+ADRIFT = Number(1.5, "-", "by which faster drift grows with each unexplained scan", "derived: 2 s to a per cent")
 MOST_ADRIFT = Number(1e4, "-", "at most, of its variance", "derived: ten per cent of the field")
 """What may explain a scan: log priors, and the budget."""
 
@@ -123,7 +102,7 @@ START_RUNGS = Number(9.0, "-", "sizes of a difference between skin and bundle", 
 START_GAIN = Number(1.0, "-", "log of an unknown board's gain", "chosen: free")
 START_FIELD = Number(0.05, "-", "log conductivity of an unknown sheet, uneven", "chosen: sheets dry by 5 %")
 START_FIELD_LENGTH = Number(1.0, "unit", "over which it is even", "chosen: half a side")
-START_GRAIN = Number(0.05, "-", "by which it conducts better one way", "chosen: as START_FIELD")
+START_GRAIN = Number(0.05, "-", "by which it conducts better one way", "derived: as START_FIELD")
 START_CONTACT = Number(0.3, "-", "a contact impedance of an unknown skin", "derived: as the networks were trained")
 START_LAYER = Number(0.03, "-", "a contact's part in series, against its rest", "measured: trust --plan drift")
 START_ABSOLUTE = Number(3e-5, "-", "what no model of |Z| gets right", "measured: two meshes of one skin")
@@ -133,9 +112,7 @@ START_SEEN_SHARE = Number(0.2, "-", "of the places and sizes where it may", "cho
 START_PAST = Number(10.0, "nat", "of a touch's evidence lost, beyond which none is sought", "derived: less than e^-10")
 START_TOUCHES = Number(3.0, "-", "touches at a start at most", "chosen: as networks were trained")
 START_NATS = Number(30.0, "nat", "by which a touch explains the first scans better", "measured: tests of the start")
-START_SURE = Number(
-    16.0, "-", "times the least difference that a touch may stand beside, and surely is one", "measured: as START_NATS"
-)
+START_SURE = Number(16.0, "-", "times the least difference beside which a touch is sure", "measured: as START_NATS")
 START_SURE_CHI2 = Number(3.0, "-", "chi^2 a measurement that such a touch leaves at most", "measured: as START_NATS")
 """What a skin may be before its first baseline."""
 
@@ -144,43 +121,31 @@ TARE_RETRIES = Number(8.0, "-", "scans after which a first baseline is tried aga
 TARE_QUARTERS = Number(4.0, "-", "parts of them that must agree", "chosen: a press of a second is one")
 TARE_DISAGREES = Number(1e-5, "-", "probability that quiet scans are refused", "chosen: once in a year of starts")
 TARE_HARMLESS = Number(5e-5, "-", "change within them that does no harm", "derived: half of one scan's noise")
-TARE_NOISY = Number(
-    0.05, "-", "noise beyond which no touch could be told", "chosen: the weakest touches change as much"
-)
-TARE_UNTRAINED = Number(
-    0.0056, "-", "noise beyond which no network was trained", "derived: 45 dB, models/augmentation.py"
-)
+TARE_NOISY = Number(0.05, "-", "noise beyond which no touch could be told", "chosen: the weakest touches' change")
+TARE_UNTRAINED = Number(0.0056, "-", "noise beyond which no network was trained", "derived: 45 dB, models/augmentation")
 TARE_DRIFTS = Number(3e-3, "-", "log conductivity, change while they come", "derived: a degree in 3 s")
 AGES = (
     Number(0.0, "-", "of a baseline's age, that its skin has drifted by: as if just taken", "derived: the least"),
     Number(0.1, "-", "the same: a tenth as far as its rates say", "derived: half way, in decades, to noise"),
     Number(1.0, "-", "the same: as far as its rates say", "derived: the most"),
 )
-YOUNGER = Number(
-    10.0, "nat", "by which less drift must be likelier, for each touch more", "chosen: 30 counts 7 of 80 rows worse"
-)
+YOUNGER = Number(10.0, "nat", "by which less drift wins, per further touch", "chosen: by 30, 7 of 80 rows are worse")
 OLDEST_S = Number(600.0, "s", "age of a baseline beyond which it is no older", "derived: FIELD_RATE makes 12 % of it")
 TARE_IDENTICAL = Number(1e-12, "-", "noise below which scans are the same", "derived: arithmetic of their mean")
 TARE_ASSUMED = Number(1e-3, "-", "noise where scans tell none", "chosen: 60 dB, ten times the board's")
-LAG_SCANS = Number(
-    2.0, "-", "scans for which one waits to be believed untouched", "derived: a ramp of 150 ms shows in 2"
-)
+LAG_SCANS = Number(2.0, "-", "scans that one waits to be believed untouched", "derived: they show a ramp of 150 ms")
 STRANGE = Number(0.1, "-", "of a scan left by touches, from which on it is of none", "chosen: odd touches leave 0.02")
 TOUCHED_LEARNS_S = Number(1.0, "s", "after which drift is learnt beside touches", "chosen: a fidgeting finger's own")
 SLOW_S = Number(10.0, "s", "after which a slow press is told from drift", "chosen: half of the slowest press")
 SLOW_EVERY_S = Number(1.0, "s", "from look to look for one", "chosen: cost, 4 ms")
-SLOW_TIMES = Number(
-    400.0, "-", "times FIELD_FASTER^2: drift meanwhile", "derived: contacts 4 %, five times CONTACT_RATE"
-)
+SLOW_TIMES = Number(400.0, "-", "times FIELD_FASTER^2: drift meanwhile", "derived: contacts 4 %, 5 times CONTACT_RATE")
 CHANGING_S = Number(0.1, "s", "for which what nothing explains is said to be changing", "derived: two whole scans")
 LOST_S = Number(1.0, "s", "of nothing that explains it, after which no touch is vouched for", "derived: half of 2 s")
 LOST_SCANS = Number(8.0, "-", "whole scans from search to search then", "chosen: cost, three searches a second")
 GAP_S = Number(0.13, "s", "without a scan, after which touches may be anywhere", "derived: three whole scans")
 DOUBT_Z2 = Number(400.0, "-", "z^2 of a touch that every whole scan asks whether it is drift", "derived: 20 sigmas")
 DOUBT_SCANS = Number(10.0, "-", "whole scans after which every touch is asked that", "derived: twice a second")
-ODD_OUTLINE = Number(
-    12.0, "-", "squared sigmas of an outline that may be several touches", "derived: 9 figures, 1.5 sd"
-)
+ODD_OUTLINE = Number(12.0, "-", "squared sigmas of an outline that may be several", "derived: 9 figures, 1.5 sd")
 ODDER = Number(1.5, "-", "times as odd as when it was asked last: it is asked again", "chosen: cost")
 SURE_SCANS = Number(2.0, "-", "whole scans that need a weak touch, after which it is shown", "derived: a chance twice")
 LEAST_LIVE = Number(0.5, "-", "share of the measurements that must count", "chosen: half, to see a touch anywhere")
@@ -189,12 +154,8 @@ LINE_SCANS = Number(100.0, "-", "untouched scans after which lines are made anew
 
 SHORT_OHM = Number(1e-3, "ohm", "between electrodes whose wires touch, of a sheet of 1 S", "chosen: any small one")
 NEXT_TO_NOTHING = Number(0.05, "-", "of the median |Z|: a fault leaves nothing to see", "derived: 20 times the noise")
-OPEN_SHARE = Number(
-    0.8, "-", "of an electrode's measurements that fail where it is open", "chosen: half again of any other's"
-)
-FAR = Number(
-    10.0, "-", "times its prediction, or its inverse: a measurement that fails", "derived: no touch, no contact"
-)
+OPEN_SHARE = Number(0.8, "-", "of an open electrode's measurements: they fail", "chosen: half more than of others")
+FAR = Number(10.0, "-", "times its prediction, or its inverse: a failed measurement", "derived: no touch or contact")
 FALLS = Number(0.03, "-", "relative fall that no touch, warmth or noise makes", "measured: as the wiring of before")
 MISFIT_MOST = Number(10.0, "-", "times FALLS, beyond which a misfit counts no more", "chosen: a third")
 LOG_PRIOR_WIRE = Number(-16.3, "nat", "log prior of a fault of the wires", "derived: one in 1e5 scans, 120 couples")
@@ -214,35 +175,24 @@ CONTACTS_EXACT = Number(6, "-", "changes of contacts fitted exactly", "derived: 
 CONTACT_MISFIT = Number(2e-3, "-", "what its columns get wrong, relative", "measured: 0.5e-3 at 8 times, stub's mesh")
 GAIN_CHANGES = Number(0.1, "-", "log of a gain's step, one sigma", "data sheet: AD5940, RTIA and PGA")
 GAIN_LEAST = Number(5e-4, "-", "log of a gain's step that is one", "derived: five sigmas; drift explains smaller ones")
-LOG_PRIOR_CONTACT = Number(
-    -14.3, "nat", "log prior of a contact that changes", "derived: one in 1e5 scans, 16 electrodes"
-)
+LOG_PRIOR_CONTACT = Number(-14.3, "nat", "of a contact that changes", "derived: one in 1e5 scans, 16 electrodes")
 LOG_PRIOR_GAIN = Number(-9.2, "nat", "of a gain that steps", "derived: one in 1e4 scans")
-FAULT_SURE = Number(8.0, "nat", "by which such a fault must be likelier than touches", "derived: one error in 3000")
+FAULT_SURE = Number(8.0, "nat", "by which one, or a touch on an electrode, is likelier", "derived: one error in 3000")
 CONTACT_WALK_CHANGED = Number(0.1, "-", "walk of a changed contact in a scan, of itself", "measured: 9 times in 6.5 s")
-CONTACT_STILL = Number(
-    0.01, "-", "step in a scan, of itself, of a contact that has settled", "derived: a tenth of that"
-)
+CONTACT_STILL = Number(0.01, "-", "step in a scan, of itself, when settled", "derived: 0.1 CONTACT_WALK_CHANGED")
 CONTACT_SETTLES_S = Number(10.0, "s", "still for so long it is the skin's own", "chosen: named long enough to be read")
 CONTACT_BACK = Number(0.004, "-", "change below which a contact is well again", "derived: ten sigmas of the filter's")
 BACK_SCANS = Number(3.0, "-", "whole scans for which it must be", "chosen: a loose wire flaps no faster")
-CONTACT_TOLD = Number(
-    24.0, "nat", "by which a contact is likelier than a touch on it", "measured: light touches reach 18, 6 beyond"
-)
-TOUCH_TOLD = Number(8.0, "nat", "by which a touch on an electrode is likelier than its contact", "derived: FAULT_SURE")
+CONTACT_TOLD = Number(24.0, "nat", "by which a contact is likelier than a touch", "measured: light touches reach 18")
 TOUCH_SECOND = Number(4.0, "1/unit^4", "what a touch does to its electrode, of its action squared", "measured: 4 A^2")
-NAMED_SCANS = Number(
-    2.0, "-", "further scans after which what may be a touch is named", "chosen: as the service before"
-)
+NAMED_SCANS = Number(2.0, "-", "scans more after which what may be a touch is named", "chosen: as the service before")
 CONTACT_PLAIN = Number(0.5, "-", "change that is named at once", "measured: touches on electrodes reach 0.35")
 PACE_S = Number(0.6, "s", "for which a contact that drifts goes on steadily", "chosen: a press takes less to come")
 PACE_LEAST = Number(0.02, "-", "of its impedance, least change in that time", "derived: 3 % a second")
 PACE_BENDS = Number(0.15, "-", "of the way, from a straight line", "chosen: as the service before")
 PACE_UNSEEN = Number(0.01, "1/s", "pace of a contact that is followed unsaid", "measured: drifts of 0.1 to 1 %/s")
 PACE_GROWS = Number(2.0, "-", "times its pace that a contact may drift", "chosen: as it turns round")
-UNDECIDED_SETTLES_S = Number(
-    60.0, "s", "still for so long, what may be a touch is the skin's", "chosen: nobody rests so"
-)
+UNDECIDED_SETTLES_S = Number(60.0, "s", "still so long, what may be a touch is the skin's", "chosen: nobody rests so")
 GAIN_Z2 = Number(25.0, "-", "squared sigmas that all values share, from which a gain's step is asked", "derived: 1e-6")
 GAIN_GROSS = Number(0.14, "-", "log of a step that no sound board's gain makes", "data sheet: RTIA and PGA, a tenth")
 GAIN_LASTS_S = Number(1.0, "s", "for which such a step must last to be taken over", "chosen: as the service before")
@@ -251,9 +201,7 @@ CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itsel
 ON_ELECTRODE = Number(0.2, "unit", "gap below which a touch changes an electrode's contact", "derived: its width")
 ACTS_Z2 = Number(9.0, "-", "squared sigmas of a touch's action, below which it may be none", "derived: 3 sigmas")
 SMALL = Number(0.2, "unit", "radius of a touch that may be an electrode's contact", "derived: an electrode's width")
-LOG_PRIOR_SMALL = Number(
-    -8.0, "nat", "log prior of such a touch on an electrode", "derived: share of the sheet that it is"
-)
+LOG_PRIOR_SMALL = Number(-8.0, "nat", "log prior of such a touch on an electrode", "derived: its share of the sheet")
 COUNT_DOUBTS = (2, 8, 24)  # whole scans of a touch, at which it is asked whether it is several
 TOLD_BY = Number(24.0, "-", "measurements since a change began, at least", "derived: two parts; one is as well a touch")
 STANDS_WAY = Number(0.02, "unit", "way of a touch that stands, in a scan", "derived: 1 mm")
