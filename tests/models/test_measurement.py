@@ -66,8 +66,8 @@ def test_fields_and_contacts_do_what_finite_elements_say() -> None:
         contact[electrode] *= 1.01
         assert off(tables().contact[:, electrode], log_change(1.0, contact) / 0.01) < 0.03
     driven = (tables().pattern[:, :2, None] == np.arange(16)).any(axis=1)
-    assert tables().layer == pytest.approx(driven * 0.01 / 0.2 / untouched()[:, None], rel=0.02)  # ohm unit over width
-    assert (tables().layer <= tables().contact * 1.05).all()
+    assert tables().series == pytest.approx(driven * 0.01 / 0.2 / untouched()[:, None], rel=0.02)  # ohm unit over width
+    assert (tables().series <= tables().contact * 1.05).all()
 
 
 def test_tables_are_relative_to_what_was_measured_up_to_a_common_gain() -> None:
@@ -79,7 +79,7 @@ def test_tables_are_relative_to_what_was_measured_up_to_a_common_gain() -> None:
     seen, unlike = made.relative_to(other), made.misfit * np.outer(row, row)
     for name in ("jacobian", "along", "turned"):
         assert_allclose(getattr(seen, name), getattr(made, name) * row, rtol=1e-5)
-    for name in ("contact", "layer"):
+    for name in ("contact", "series"):
         assert_allclose(getattr(seen, name), getattr(made, name) * row[:, None])
     assert_allclose(seen.field[:, 1:], made.field[:, 1:] * row[:, None], rtol=1e-3, atol=1e-6)
     assert_allclose(seen.field[:, 0], seen.contact.sum(axis=1) - 1)
@@ -97,7 +97,7 @@ def test_tables_and_grid_through_a_fault_are_those_of_the_measurements_it_mixes(
     assert DiscResponse(seen)(*place) == pytest.approx(mixes @ DiscResponse(tables())(*place), abs=1e-6)
     for name in ("along", "turned"):
         assert_allclose(getattr(seen, name), getattr(tables(), name) @ mixes.T, atol=1e-6)
-    for name in ("contact", "layer", "field"):
+    for name in ("contact", "series", "field"):
         assert_allclose(getattr(seen, name), mixes @ getattr(tables(), name), atol=1e-12)
     mixed = mixes @ tables().misfit @ mixes.T
     assert_allclose(seen.misfit, mixed / np.trace(mixed), atol=1e-12)

@@ -17,7 +17,7 @@ from models.measurement.responses.tables import SkinTables, tables_of
 from models.patterns import adjacent, pairs
 from models.shapes import Shape
 from protocol.scan_setting import COHERENT
-from services.estimation.faults.impedance import ContactChange, ContactColumns, Unexplained, gain_change
+from services.estimation.faults.impedance import Change, ContactColumns, Unexplained, gain_change
 from services.estimation.faults.table import BoardScan, WireTable, any_touches
 from services.estimation.faults.wires import WireFault, WireKind, WireMaps
 from services.runtime.config import ScanMode
@@ -192,7 +192,7 @@ def test_a_fault_is_told_by_one_scan_whatever_touches_and_also_where_it_begins_o
             z, status = (np.where(late, after[k], before[k]) for k in (0, 1))
             failed = ~np.isfinite(z) | (z <= 0) | (status != 0)
             log_z, live = np.log(np.where(failed, 1.0, z)), np.ones(len(z), bool)
-            scan = BoardScan(log_z, untouched(), failed, live, MEASURED_S, SPAN_S)
+            scan = BoardScan(log_z, untouched(), failed, live, MEASURED_S)
             assert WireTable(MAPS).suspicious(scan, standing)
             first, *others = WireTable(MAPS).guesses(scan, standing, every_touch, 2 * NOISE**2 * np.eye(len(PATTERN)))
             assert first.fault == expected
@@ -225,7 +225,7 @@ def asked(log_z: Array) -> Unexplained:
     return Unexplained(log_z - untouched(), ones, ones > 0, TIMES_S, SPAN_S, Whitening.of(covariance))
 
 
-def likeliest(log_z: Array) -> tuple[ContactChange, float]:
+def likeliest(log_z: Array) -> tuple[Change, float]:
     """And by how much it is likelier than the next."""
     found = ContactColumns.of(tables()).changes(asked(log_z), np.arange(16), np.full(16, -np.inf))
     found.sort(key=lambda change: -change.score)

@@ -33,7 +33,7 @@ class SkinTables:
     along: Single  # (F, F, K) the same of a drop along x less one along y
     turned: Single  # (F, F, K) of a drop that turns a field along x into a current along y
     contact: Array  # (K, E) per relative change of a contact impedance
-    layer: Array  # (K, E) the part of `contact` that is in series with the sheet, at the electrode's own measurements
+    series: Array  # (K, E) the part of `contact` that is in series with the sheet, at the electrode's own measurements
     field: Array  # (K, M) per log conductivity of the sheet, in the modes of FIELD_DEGREES
     misfit: Array  # (K, K) covariance of trace 1: the colour of what linear discs get wrong
     inside: NDArray[np.bool_]  # (F, F) pixels on the skin
@@ -98,7 +98,7 @@ class SkinTables:
             along=(self.along * row).astype(np.float32),
             turned=(self.turned * row).astype(np.float32),
             contact=contact,
-            layer=self.layer * row[:, None],
+            series=self.series * row[:, None],
             field=_field(jacobian, contact),
             misfit=_of_trace_one(self.misfit * np.outer(row, row)),
             z0=z0,
@@ -114,7 +114,7 @@ class SkinTables:
             along=self.along @ single,
             turned=self.turned @ single,
             contact=slopes @ self.contact,
-            layer=slopes @ self.layer,
+            series=slopes @ self.series,
             field=slopes @ self.field,
             misfit=_of_trace_one(slopes @ self.misfit @ slopes.T),
             map=None if self.map is None else self.map.through(slopes),
@@ -153,7 +153,7 @@ def tables_of(bundle: Bundle) -> SkinTables:
         along=along,
         turned=turned,
         contact=contact,
-        layer=_layer(bundle, z0) if self_sensing and "contact_impedance" in bundle.skin else contact,
+        series=_series(bundle, z0) if self_sensing and "contact_impedance" in bundle.skin else contact,
         field=_field(jacobian, contact),
         misfit=_of_trace_one(np.asarray(misfit)),
         inside=np.kron(np.asarray(matrices.inside, bool), np.ones((times, times), bool)),
@@ -179,7 +179,7 @@ def _from_pixels(jacobian: NDArray[np.floating]) -> Single:
     return np.ascontiguousarray(np.asarray(jacobian, np.float32).T.reshape(side, side, -1))
 
 
-def _layer(bundle: Bundle, z0: Array) -> Array:
+def _series(bundle: Bundle, z0: Array) -> Array:
     """(K, E): a layer's impedance over its electrode's width adds to every measurement that drives there."""
     skin, pattern = bundle.skin, np.asarray(bundle.pattern)
     series = np.asarray(skin["contact_impedance"], float) / np.asarray(skin["electrodes"]["width"], float)

@@ -55,11 +55,9 @@ def judgements_of(
     found = [judge("silent", failed, n.SILENT)]
     for state, row in ROW_OF.items():
         named = np.flatnonzero(states == state)
-        where = int(named[0]) if len(named) else -1
-        if undecided and state == DRIFTING:  # it may not be named yet
-            found.append(judge(row, 1.0, 1.0, where, Verdict.REFUSE))
-        else:
-            found.append(judge(row, len(named), 1.0, where))
+        doubtful = undecided and state == DRIFTING  # it may not be named yet
+        statistic, where = 1.0 if doubtful else len(named), int(named[0]) if len(named) else -1
+        found.append(judge(row, statistic, 1.0, where, Verdict.REFUSE if doubtful else None))
     found.append(judge("saturated", float(np.mean(status & (STATUS_CLIPPED | STATUS_RTIA) != 0)), ANY))
     found.append(judge("fifo", float(np.mean(status & STATUS_FIFO != 0)), ANY))
     lost = int(np.isin(states, (OPEN, SHORT, DRIFTING, SWAPPED)).sum())
@@ -73,21 +71,17 @@ def sentences(states: NDArray[np.uint8], wire: WireFault | None, silent: bool) -
     if silent:
         return [NO_ANSWER]
     if wire is not None and wire.kind is WireKind.STUCK:
-        return [_stuck_bit(wire)]
+        return [
+            f"an address bit of a multiplexer is stuck: bit {wire.bit} of drive{wire.side} or sense{wire.side} stays "
+            f"{wire.value}, so electrodes {_listed(wire.electrodes)} (numbered from 0) are never reached; look at the "
+            "board's address lines"
+        ]
     found = []
     for state, text in ADVICE.items():
         named = np.flatnonzero(states == state).tolist()
         if named:
             found.append(text.format(_listed(named)) + " (electrodes are numbered from 0)")
     return found
-
-
-def _stuck_bit(fault: WireFault) -> str:
-    return (
-        f"an address bit of a multiplexer is stuck: bit {fault.bit} of drive{fault.side} or sense{fault.side} stays "
-        f"{fault.value}, so electrodes {_listed(fault.electrodes)} (numbered from 0) are never reached; look at the "
-        "board's address lines"
-    )
 
 
 def _listed(numbers: Iterable[int]) -> str:

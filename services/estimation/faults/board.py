@@ -20,14 +20,7 @@ from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
 from services.estimation.faults import advice, wires
 from services.estimation.faults.contact_state import ContactState
-from services.estimation.faults.impedance import (
-    ContactChange,
-    ContactColumns,
-    GainChange,
-    Unexplained,
-    gain_change,
-    gain_onset,
-)
+from services.estimation.faults.impedance import MOST_LOG, Change, ContactColumns, Unexplained, gain_change, gain_onset
 from services.estimation.faults.table import BoardScan, WireTable
 from services.estimation.faults.wires import WireFault, WireKind, WireMaps
 from services.estimation.filter import Prediction
@@ -37,7 +30,6 @@ from services.estimation.values import numbers as n
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Ask = Callable[[Innovation], ScoredAnswer]
-Change = ContactChange | GainChange
 
 LEAST = -0.95  # relative: nothing takes all of an impedance away
 SCAN_S = 0.044
@@ -95,14 +87,14 @@ class BoardView:
     mean: Array  # (K,) relative change by contact impedances
     spread: Array  # (K, n) columns of unit variance of what is not known of it, the changed contact's own first
     contact: int  # electrode whose contact impedance is changed, as far as is known before; -1: none
-    apart: bool = True  # `shown` is without contact impedances that changed
+    apart: bool  # `shown` is without contact impedances that changed
 
     @property
     def y(self) -> Array:
         """(K,) log |Z| over what is predicted without touches."""
         left = self.log_z - self.shown
         if self.apart:
-            left = np.log1p(np.maximum(np.expm1(np.minimum(left, 3.0)) - self.mean, LEAST))
+            left = np.log1p(np.maximum(np.expm1(np.minimum(left, MOST_LOG)) - self.mean, LEAST))
         return np.where(self.live, left, 0.0)
 
     def covariance(self, skin: Array, own: Array) -> Array:
@@ -155,12 +147,6 @@ class BoardFaults:
         return replace(self._columns, settled=self.now.settled)
 
     @property
-    def _columns_now(self) -> ContactColumns:
-        """About the contact that stands changed."""
-        now = self.now
-        return self.columns if now.contact < 0 else self.columns.with_change(now.contact, now.size)
-
-    @property
     def exchanged(self) -> bool:
         """Whether wires are exchanged: every measurement is there, in another's place."""
         return self.now.wire is not None and self.now.wire.kind is WireKind.EXCHANGED
@@ -174,9 +160,8 @@ class BoardFaults:
 
     def taken_off(self, over: Array) -> Array:
         """(K,) log |Z| over an untouched skin without what the board and contacts have for good. over (K,)."""
-        now = self.now
-        left = over - now.log_gain
-        if now.settled.any():
+        left = over - self.now.log_gain
+        if self.now.settled.any():
             left = np.log1p(np.maximum(np.expm1(left) - self.columns.settled_mean(), LEAST))
         return np.asarray(left)
 
@@ -193,9 +178,9 @@ class BoardFaults:
         if now.wire is None:
             failed = dead = self._known & (~readable | (np.abs(log_z - sound - np.log1p(mean)) > np.log(n.FAR)))
             now.silent = bool(failed.mean() >= n.SILENT)
-            now.opens = () if now.silent else wires.open_electrodes(failed, self.member)[0]
+            now.opens = () if now.silent else wires.open_electrodes(failed, self.member)
             now.lifted = tuple(k for k in now.lifted if k in now.opens)
-            lifted = self._lifted()
+            lifted = self._columns.shunt[:, list(now.lifted)] * n.SHORT_WAY  # (K, n) no electrode shunts the sheet
             mean, spread = mean + lifted.sum(axis=1), np.hstack([spread, n.SHORT_WAY_SD * lifted])
         else:
             apart = self.exchanged  # each measurement is another's then, its contacts as well
@@ -219,23 +204,17 @@ class BoardFaults:
         spread = columns.spread(now.contact, now.size, np.sqrt(now.variance), course)
         return mean + np.where(since, after, before), spread * since[:, None]
 
-    def _lifted(self) -> Array:
-        """(K, n) relative changes by electrodes that are off the skin, by all the rest of their contacts."""
-        return np.asarray(self._columns.rest[:, list(self.now.lifted)] * n.SHORT_WAY)
-
     # --- wires ---
 
     def suspects_wires(self, view: BoardView) -> bool:
         """Whether it is worth asking if the wires have changed."""
-        if view.failed.mean() >= n.SILENT:
-            return False
-        return self._table.suspicious(self._untouched(view), self.now.wire)
+        return view.failed.mean() < n.SILENT and self._table.suspicious(self._wire_scan(view), self.now.wire)
 
     def wires_changed(self, view: BoardView, touched: Array, skin: Array, own: Array) -> bool:
         """Whether the wires are otherwise than they were. touched (K,): relative change by touches that stand; skin and
         own as for `covariance`.
         """
-        now, untouched = self.now, self._untouched(view)
+        now, untouched = self.now, self._wire_scan(view)
         failed = view.failed & untouched.known
         scan = replace(untouched, predicted=untouched.predicted + np.log1p(touched), failed=failed)
         found = self._table.guesses(scan, now.wire, skin + self._any_touch, own)
@@ -245,8 +224,7 @@ class BoardFaults:
             return False
         if now.wire is None and best.score < self._by_gain(view, touched, skin + own) + n.WIRE_APART:
             return False
-        now.wire, now.wire_since_s = best.fault, view.at.middle_s + best.since_s
-        now.unexplained_scans = 0
+        now.wire, now.wire_since_s, now.unexplained_scans = best.fault, view.at.middle_s + best.since_s, 0
         return True
 
     def _by_gain(self, view: BoardView, touched: Array, covariance: Array) -> float:
@@ -257,15 +235,14 @@ class BoardFaults:
         since = -np.inf, gain_onset(scan)
         return float(n.LOG_PRIOR_GAIN) + max(gain_change(scan, since_s).score for since_s in since)
 
-    def _untouched(self, view: BoardView) -> BoardScan:
+    def _wire_scan(self, view: BoardView) -> BoardScan:
         """As the wires are asked about it: what open electrodes explain tells nothing of the others' wires."""
-        sound = view.sound + np.log1p(view.mean)
-        failed = view.failed
+        sound, failed = view.sound + np.log1p(view.mean), view.failed
         if self.now.wire is None:
             failed = failed | (np.abs(view.log_z - sound) > np.log(n.FAR))
-        opens, _ = wires.open_electrodes(failed & self._known, self.member)
+        opens = wires.open_electrodes(failed & self._known, self.member)
         known = self._known & ~self.member[:, list(opens)].any(axis=1)
-        return BoardScan(view.log_z, sound, failed & known, known, view.at.times_s, view.at.span_s)
+        return BoardScan(view.log_z, sound, failed & known, known, view.at.times_s)
 
     # --- contact impedances and gain ---
 
@@ -275,12 +252,10 @@ class BoardFaults:
             return False
         fit, association = answer.fit, answer.association
         new = fit is not None and any(association[k] < 0 and self._may_be_a_contact(fit, k) for k in range(len(fit)))
-        return new or not answer.holds or answer.cause != AS_IT_IS or self.shared_z2(answer) > n.GAIN_Z2
-
-    def shared_z2(self, answer: ScoredAnswer) -> float:
-        """How much all values have in common beyond what explains a scan, in squared sigmas."""
-        even = np.ones(len(answer.weighted_residual))
-        return float(answer.weighted_residual.sum()) ** 2 / answer.information(even)
+        if new or not answer.holds or answer.cause != AS_IT_IS:
+            return True
+        common = np.ones(len(answer.weighted_residual))
+        return float(answer.weighted_residual.sum()) ** 2 / answer.information(common) > n.GAIN_Z2
 
     def explained_by_fault(
         self, without: Explanation, touched: Array, nearby: Array, ask: Ask, doubted: Array | None = None
@@ -292,27 +267,31 @@ class BoardFaults:
         view, innovation, answer = without.view, without.innovation, without.answer
         if innovation.budget.left <= 0:  # what is left open is asked again with the scans that follow
             return None
-        columns, any_touch = self._columns_now, view.through(self._any_touch)
+        columns = self.columns
+        if self.now.contact >= 0:  # about the contact that stands changed
+            columns = columns.with_change(self.now.contact, self.now.size)
         if view.slopes is not None:
             columns = columns.through(view.slopes)
-        changes = self._likeliest(innovation, columns, any_touch, touched, nearby, unexplained=not answer.holds)
+        changes = self._likeliest_changes(without, columns, touched, nearby)
         innovation = replace(innovation, keeps=0.0)
-        best, least = None, answer.score + (self._sure(answer) if doubted is None else _log_prior_on_electrode(doubted))
+        odds = self._least_odds(answer) if doubted is None else n.LOG_PRIOR_TOUCH + n.LOG_PRIOR_SMALL * _small(doubted)
+        best, least = None, answer.score + odds
         for k, change in enumerate(changes, 1):
-            asked, column = self._with(innovation.leaving(1 - k / len(changes)), columns, change)
+            asked, column = self._given(innovation.leaving(1 - k / len(changes)), columns, change)
             found = ask(asked)
-            score = found.score + (0.0 if self._goes_on(change, view) else _cost(change))
-            if score >= least and self._passes(change, column, found, score, answer):
+            goes_on = not change.is_gain and change.electrode == self.now.contact and self.began_within(view)
+            score = found.score + (0.0 if goes_on else change.log_prior)
+            if score >= least and self._believed(change, column, found, score, answer):
                 best, least = (change, column, asked, found), score
         if best is None:
             return None
         change, column, asked, found = best
-        self._take(view, change, float(column @ found.weighted_residual))
-        if isinstance(change, ContactChange):
+        self._adopt(view, change, float(column @ found.weighted_residual))
+        if not change.is_gain:
             self.now.doubt.beside = self._beside(change, found)
         return Explanation(view, asked, found, changed=True)
 
-    def _passes(self, change: Change, column: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer) -> bool:
+    def _believed(self, change: Change, column: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer) -> bool:
         """Whether a change may be believed that is likely enough. column (K,): of unit variance of what it may be;
         found: the answer with it, and its score; answer: the one without.
         """
@@ -320,42 +299,36 @@ class BoardFaults:
             return False
         if self._beside(change, found) and score < answer.score + n.FAULT_SURE:
             return False  # a touch takes the contact along: both are not likelier for being seldom touches
-        if isinstance(change, GainChange):  # else the touches of the answer explain all of it
-            told = abs(float(column @ found.weighted_residual)) * n.GAIN_CHANGES >= n.GAIN_LEAST
+        sigmas = float(column @ found.weighted_residual)
+        if change.is_gain:
+            significant = abs(sigmas) * n.GAIN_CHANGES >= n.GAIN_LEAST
         else:
-            told = _told(column, found)
-        plainly = self._tells and found.chi2 < n.MOST and score > answer.score + n.WIRE_SURE
-        return told and (found.holds or plainly)
+            significant = sigmas**2 > n.ACTS_Z2 * max(1 - found.information(column), 0.0)
+        if not significant:  # the touches of the answer explain all of it
+            return False
+        return found.holds or (self._tells and found.chi2 < n.MOST and score > answer.score + n.WIRE_SURE)
 
     def _beside(self, change: Change, answer: ScoredAnswer) -> bool:
         """Whether a touch of the answer may change the contact impedance that is said to change."""
-        if isinstance(change, GainChange) or answer.fit is None:
+        if change.is_gain or answer.fit is None:
             return False
         return any(self._reaches(state, change.electrode) for state in answer.fit.states)
-
-    def _goes_on(self, change: Change, view: BoardView) -> bool:
-        """Whether it is the contact that has begun to change within this scan."""
-        return isinstance(change, ContactChange) and change.electrode == self.now.contact and self.began_within(view)
 
     def began_within(self, view: BoardView) -> bool:
         """Whether the contact's change began after the oldest value of a scan."""
         return self.now.contact_since_s > view.at.oldest_s
 
-    def _sure(self, answer: ScoredAnswer) -> float:
+    def _least_odds(self, answer: ScoredAnswer) -> float:
         """By how much a fault must be likelier than an answer: small new touches on electrodes are seldom touches."""
-        if answer.fit is None:
-            return n.FAULT_SURE
-        doubtful = [
-            place < 0 and _small(state) and self.on_electrode(state)
-            for state, place in zip(answer.fit.states, answer.association, strict=True)
-        ]
-        if any(doubtful):
-            return n.LOG_PRIOR_SMALL * sum(doubtful)
-        return n.FAULT_SURE
+        doubtful = 0
+        if answer.fit is not None:
+            for state, place in zip(answer.fit.states, answer.association, strict=True):
+                doubtful += place < 0 and _small(state) and self.on_electrode(state)
+        return n.LOG_PRIOR_SMALL * doubtful if doubtful else n.FAULT_SURE
 
     def on_electrode(self, state: Array) -> bool:
         """Whether the middle of a touch (7,) lies on an electrode."""
-        return bool(np.hypot(*(state[PLACE] - self._places).T).min() < n.ON_ELECTRODE)
+        return bool(self._distances(state).min() < n.ON_ELECTRODE)
 
     def in_question(self, state: Array) -> bool:
         """Whether a touch (7,) lies on an electrode whose contact impedance has changed, or is the touch."""
@@ -366,9 +339,13 @@ class BoardFaults:
         """Whether a touch (7,) may change the contact impedance of an electrode."""
         return bool(self._gaps(state)[electrode] < n.ON_ELECTRODE)
 
+    def _distances(self, state: Array) -> Array:
+        """(E,) from the middle of a touch (7,) to that of each electrode."""
+        return np.asarray(np.hypot(*(state[PLACE] - self._places).T))
+
     def _gaps(self, state: Array) -> Array:
         """(E,) from the edge of a touch (7,) to the middle of each electrode."""
-        return np.asarray(np.hypot(*(state[PLACE] - self._places).T) - np.exp(state[LOG_RADIUS]))
+        return np.asarray(self._distances(state) - np.exp(state[LOG_RADIUS]))
 
     def _may_be_a_contact(self, fit: FoundTouches, k: int) -> bool:
         """Whether a touch that was found is so near an electrode that a contact impedance may look like it."""
@@ -376,19 +353,14 @@ class BoardFaults:
         unsure = 3 * float(np.sqrt(max(np.trace(variance), 0.0)))
         return bool(self._gaps(fit.states[k]).min() < n.ON_ELECTRODE + unsure)
 
-    def _likeliest(
-        self,
-        innovation: Innovation,
-        columns: ContactColumns,
-        any_touch: Array,
-        touched: Array,
-        nearby: Array,
-        unexplained: bool,
+    def _likeliest_changes(
+        self, without: Explanation, columns: ContactColumns, touched: Array, nearby: Array
     ) -> list[Change]:
         """At most three changes that may explain a scan: with the touches as they stand, with any touches, or, where
         nothing explains it, without those that stood; and whatever touches: a gain changes all measurements alike.
         """
-        found = list[Change]()
+        found, innovation, unexplained = list[Change](), without.innovation, not without.answer.holds
+        any_touch = without.view.through(self._any_touch)
         tried = [(touched, nearby, float(n.MOST)), (touched, nearby + any_touch, np.inf)]
         if unexplained and touched.any():
             tried.insert(0, (np.zeros_like(touched), np.zeros_like(nearby), float(n.MOST)))
@@ -396,30 +368,27 @@ class BoardFaults:
             y = np.where(innovation.live, innovation.y - np.log1p(touched), 0.0)
             white = Whitening.of(innovation.covariance + more)
             scan = Unexplained(y, 1 / (1 + touched), innovation.live, innovation.times_s, innovation.span_s, white)
-            nothing = white.log_likelihood(y)
-            best = max(self._every(scan, columns), key=lambda change: change.score + _cost(change))
-            if isinstance(best, ContactChange) and abs(best.size) > n.CONTACT_MOST:
+            best = max(self._changes(scan, columns), key=lambda change: change.score + change.log_prior)
+            if (not best.is_gain and abs(best.size) > n.CONTACT_MOST) or scan.since(best.since_s).sum() < n.TOLD_BY:
                 continue
-            known = [_what(change) for change in found]
-            if int(scan.since(best.since_s).sum()) < n.TOLD_BY:
-                continue
-            if best.score + _cost(best) > nothing and best.chi2 < most_chi2 and _what(best) not in known:
+            likelier = best.score + best.log_prior > white.log_likelihood(y) and best.chi2 < most_chi2
+            if likelier and best.electrode not in [change.electrode for change in found]:
                 found.append(best)
-        if unexplained and len(found) < 2 and not any(isinstance(change, GainChange) for change in found):
+        if unexplained and len(found) < 2 and not any(change.is_gain for change in found):
             found.append(gain_change(scan, -np.inf))
         return found
 
-    def _every(self, scan: Unexplained, columns: ContactColumns) -> list[Change]:
+    def _changes(self, scan: Unexplained, columns: ContactColumns) -> list[Change]:
         gains = [gain_change(scan, -np.inf), gain_change(scan, gain_onset(scan))]
-        found: list[Change] = [gain for gain in gains if abs(gain.log_factor) > n.GAIN_LEAST]
+        found = [gain for gain in gains if abs(gain.size) > n.GAIN_LEAST]
         if not self._predicted:
-            return found or [gains[0]]
+            return found or gains[:1]
         return [*found, *columns.likeliest(scan)]
 
-    def _with(self, innovation: Innovation, of_contacts: ContactColumns, change: Change) -> tuple[Innovation, Array]:
+    def _given(self, innovation: Innovation, of_contacts: ContactColumns, change: Change) -> tuple[Innovation, Array]:
         """The innovation beside a change of any size, and its column (K,) of unit variance."""
         acts = np.asarray(innovation.live & (innovation.times_s >= change.since_s), float)
-        if isinstance(change, GainChange):
+        if change.is_gain:
             column = n.GAIN_CHANGES * acts
             return replace(innovation, covariance=innovation.covariance + np.outer(column, column)), column
         course = 2 * innovation.times_s / innovation.span_s
@@ -433,7 +402,7 @@ class BoardFaults:
         """An electrode under a touch that changes is not named: what it does is the touch's. One that stood may change
         from now on where a scan is not explained.
         """
-        if isinstance(change, GainChange) or answer.fit is None:
+        if change.is_gain or answer.fit is None:
             return True
         acts = answer.fit.states[:, ACTION] ** 2 > n.ACTS_Z2 * np.diag(answer.fit.covariance)[ACTION::STATES]
         priors = answer.fit.priors
@@ -443,16 +412,15 @@ class BoardFaults:
                 return False
         return True
 
-    def _take(self, view: BoardView, change: Change, told: float) -> None:
-        """told: of the change, in sigmas of its prior."""
-        now = self.now
-        since_s = view.at.middle_s + change.since_s
-        if isinstance(change, GainChange):
+    def _adopt(self, view: BoardView, change: Change, sigmas: float) -> None:
+        """sigmas: of its prior, by which it is off."""
+        now, since_s = self.now, view.at.middle_s + change.since_s
+        if change.is_gain:
             now.log_gain_before, now.gain_since_s = now.log_gain, since_s
-            now.log_gain += n.GAIN_CHANGES * told
+            now.log_gain += n.GAIN_CHANGES * sigmas
             now.gain_said_s = view.at.end_s
             now.gain_steps += 1
-            self._gross(max(since_s, view.at.oldest_s))
+            self._note_gross(max(since_s, view.at.oldest_s))
             return
         before = now.size if change.electrode == now.contact else 0.0
         if now.contact not in (-1, change.electrode) and not now.doubt.undecided:
@@ -460,13 +428,13 @@ class BoardFaults:
         if now.contact != change.electrode:
             now.doubt = ContactState()
         now.contact, now.contact_since_s, now.size_before = change.electrode, since_s, before
-        now.size = max(before + n.CONTACT_CHANGES * told, self._least_size)
+        now.size = max(before + n.CONTACT_CHANGES * sigmas, self._least_size)
         if now.size > before and not now.doubt.undecided:
             now.doubt.begin(before)
         now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
         now.still_s, now.still_size, now.back_scans = 0.0, now.size, 0
 
-    def _gross(self, since_s: float) -> None:
+    def _note_gross(self, since_s: float) -> None:
         """Whether a step of the gain is one that no sound board's makes, or the end of such a one."""
         now = self.now
         if abs(now.log_gain - now.log_gain_sound) < n.GAIN_BACK:
@@ -486,12 +454,12 @@ class BoardFaults:
             if now.unexplained_scans >= n.UNEXPLAINED_SCANS:
                 now.wire, now.unexplained_scans = None, 0
                 self.drop_contact()
-                self._gain_back()
+                self._revert_gain()
             return
         now.unexplained_scans = 0
         if now.contact < 0:
             return
-        self._step(view, answer)
+        self._update_size(view, answer)
         sd = float(np.sqrt(now.variance))
         unsure = n.CONTACT_BACK + 3 * sd
         if whole and abs(now.size) < unsure and now.doubt.falls(now.size):  # a touch took it over, or it is well
@@ -500,7 +468,7 @@ class BoardFaults:
         home = min(0.0, -float(now.settled[now.contact]), key=lambda size: abs(now.size - size))  # where it is well
         if whole:
             now.doubt.follow(view.at.middle_s, now.size, sd, home)
-        self._stays(passed_s)
+        self._time_still(passed_s)
         now.back_scans = (now.back_scans + whole) if abs(now.size - home) < unsure else 0
         now.variance += (n.CONTACT_WALK_CHANGED * self._impedance) ** 2 * min(passed_s / SCAN_S, 1.0)
         drifts = view.at.middle_s < now.doubt.drifts_until_s
@@ -516,16 +484,15 @@ class BoardFaults:
         if self.now.gain_said_s < end_s:
             self.now.log_gain_held = self.now.log_gain
 
-    def _gain_back(self) -> None:
+    def _revert_gain(self) -> None:
         """A step of the gain is taken back that no scan after it confirmed."""
         now = self.now
-        if now.log_gain == now.log_gain_held:
-            return
-        now.log_gain = now.log_gain_before = now.log_gain_held
-        now.gain_since_s = -np.inf
-        self._gross(now.gain_since_s)
+        if now.log_gain != now.log_gain_held:
+            now.log_gain = now.log_gain_before = now.log_gain_held
+            now.gain_since_s = -np.inf
+            self._note_gross(now.gain_since_s)
 
-    def _stays(self, passed_s: float) -> None:
+    def _time_still(self, passed_s: float) -> None:
         """For how long it has been still: by its way, as steps from part to part are small however it drifts."""
         now = self.now
         now.still_s += passed_s
@@ -533,14 +500,13 @@ class BoardFaults:
         if abs(now.size - now.still_size) > moves:
             now.still_s, now.still_size = 0.0, now.size
 
-    def _step(self, view: BoardView, answer: ScoredAnswer) -> None:
+    def _update_size(self, view: BoardView, answer: ScoredAnswer) -> None:
+        """The size of a contact that was known before this scan, by what the scan leaves."""
         now = self.now
-        if view.contact != now.contact:  # it was found by this scan
-            return
-        column = view.spread[:, 0]
-        sd = float(np.sqrt(now.variance))
-        now.size = max(now.size + sd * float(column @ answer.weighted_residual), self._least_size)
-        now.variance *= max(1 - answer.information(column), 1e-4)
+        if view.contact == now.contact:
+            column, sd = view.spread[:, 0], float(np.sqrt(now.variance))
+            now.size = max(now.size + sd * float(column @ answer.weighted_residual), self._least_size)
+            now.variance *= max(1 - answer.information(column), 1e-4)
 
     @property
     def _impedance(self) -> float:
@@ -586,30 +552,12 @@ class BoardFaults:
         return self.now.wire is None and self.now.contact < 0 and not self.now.opens and not self.now.silent
 
 
-def _told(column: Array, answer: ScoredAnswer) -> bool:
-    """Whether an answer knows that there is a change; column (K,): of unit variance of what it may be."""
-    return float(column @ answer.weighted_residual) ** 2 > n.ACTS_Z2 * max(1 - answer.information(column), 0.0)
-
-
 def _small(state: Array) -> bool:
     """Whether a touch (7,) is as small as an electrode's contact impedance may look."""
     return bool(state[LOG_RADIUS] < np.log(n.SMALL))
 
 
-def _log_prior_on_electrode(state: Array) -> float:
-    """Of a touch (7,) that lies on an electrode: small ones are seldom touches."""
-    return float(n.LOG_PRIOR_TOUCH + n.LOG_PRIOR_SMALL * _small(state))
-
-
-def _cost(change: Change) -> float:
-    return float(n.LOG_PRIOR_GAIN if isinstance(change, GainChange) else n.LOG_PRIOR_CONTACT)
-
-
-def _what(change: Change) -> int:
-    return change.electrode if isinstance(change, ContactChange) else -1
-
-
-def as_they_stand(slopes: Array, states: Array) -> Array:
+def standing_covariance(slopes: Array, states: Array) -> Array:
     """(K, K) covariance of what touches that stand may have changed by since; slopes (K, 7 T), states (T, 7)."""
     sds = np.zeros_like(states)
     sds[:, PLACE] = n.STANDS_WAY

@@ -16,7 +16,7 @@ from models.measurement.covariance.whitening import leave_out
 from models.measurement.fit import FoundTouches
 from models.measurement.responses.tables import SkinTables
 from services.estimation.faults.board import LEAST, BoardFaults, BoardView, Explanation
-from services.estimation.faults.impedance import ContactChange, ContactColumns, Unexplained
+from services.estimation.faults.impedance import Change, Unexplained
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import AS_IT_IS, MEMORY, Innovation, ScoredAnswer, StepBudget
 from services.estimation.values import numbers as n
@@ -28,9 +28,7 @@ SETTLES = 3  # whole scans in which a change may go on
 
 
 class ContactOrTouchTest:
-    """The likelihood ratio of a changed contact impedance and a touch on its electrode, over the mean of the scans
-    since it began: a sequential test that decides beyond either of two thresholds.
-    """
+    """A sequential likelihood ratio test over the mean of the scans since a contact impedance began to change."""
 
     def __init__(self, tables: SkinTables, hypotheses: Hypotheses, faults: BoardFaults) -> None:
         self._tables, self._hypotheses, self._faults = tables, hypotheses, faults
@@ -86,15 +84,14 @@ class ContactOrTouchTest:
         left = np.expm1(np.minimum(view.log_z - view.sound, n.MISFIT_MOST)) - touched - known
         return np.where(view.live, np.log1p(np.maximum(left, LEAST)), 0.0)
 
-    def _contact(self, asked: Innovation) -> ContactChange:
-        columns, now = self._faults.columns, self._faults.now
-        columns = columns.with_change(now.contact, now.doubt.decided)
-        whole = np.ones(len(asked.y))
-        scan = Unexplained(asked.y, whole, asked.live, asked.times_s, asked.span_s, asked.white)
+    def _contact(self, asked: Innovation) -> Change:
+        now = self._faults.now
+        columns = self._faults.columns.with_change(now.contact, now.doubt.decided)
+        scan = Unexplained(asked.y, np.ones(len(asked.y)), asked.live, asked.times_s, asked.span_s, asked.white)
         return columns.changes(scan, np.array([now.contact]), np.array([-np.inf]))[0]
 
     def _touch(self, asked: Innovation) -> ScoredAnswer:
         k = self._faults.now.contact
-        columns: ContactColumns = self._faults.columns
-        second = n.TOUCH_SECOND * np.column_stack([columns.layer[:, k], columns.rest[:, k]])
+        columns = self._faults.columns
+        second = n.TOUCH_SECOND * np.column_stack([columns.series[:, k], columns.shunt[:, k]])
         return self._hypotheses.on_electrode(asked, self._tables.places[k], second)

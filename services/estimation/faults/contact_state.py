@@ -65,21 +65,18 @@ class ContactState:
         """
         self.unsure = float(np.sqrt(n.FALSE_ALARM_Z2)) * sd
         self.seen += self.undecided
-        passed_s = at_s - self.sizes[-1].at_s if self.sizes else 0.0
-        step = size - self.sizes[-1].size if self.sizes else 0.0
-        least = self.least
+        before = self.sizes[-1] if self.sizes else SizeAt(at_s, size)
+        passed_s, step, least = at_s - before.at_s, size - before.size, self.least
         self.sizes = [*(each for each in self.sizes if each.at_s > at_s - PACES_S[-1] - passed_s), SizeAt(at_s, size)]
         if size < self.decided - least or abs(size) < n.CONTACT_STILL:  # or it is what it was at the tare
             self.end(size)
         elif not self.undecided:  # as slowly the untouched skin's contacts are followed as well
             self.decided += min(max(size - self.decided, 0.0), n.PACE_UNSEEN * passed_s)
-        drifts = at_s < self.drifts_until_s
-        if drifts and not self.undecided and abs(step) < n.PACE_GROWS * self.pace * passed_s + least:
+        steadily = abs(step) < n.PACE_GROWS * self.pace * passed_s + least
+        if at_s < self.drifts_until_s and not self.undecided and steadily:
             self.decided = size
-        pace = max(self._pace(each_s) for each_s in PACES_S)
-        if pace:
-            self.pace = pace
-            self.drifts_until_s = at_s + n.CONTACT_SETTLES_S
+        if pace := max(self._pace(each_s) for each_s in PACES_S):
+            self.pace, self.drifts_until_s = pace, at_s + n.CONTACT_SETTLES_S
             self.end(size)
         if self.stays(home):
             self.drifts_until_s = at_s
@@ -100,18 +97,16 @@ class ContactState:
 
     def _pace(self, lasts_s: float) -> float:
         """At which it moved on steadily for so long, longer than a touch takes to come; 0: it did not [1/s]."""
-        times = np.array([each.at_s for each in self.sizes])
+        times, sizes = np.array([(each.at_s, each.size) for each in self.sizes]).T
         before = np.flatnonzero(times <= times[-1] - lasts_s)
         if not before.size or len(times) - before[-1] < LEAST_SIZES:
             return 0.0
-        times = times[before[-1] :]
-        sizes = np.array([each.size for each in self.sizes])[before[-1] :]
-        way = float(sizes[-1] - sizes[0])
+        times, sizes = times[before[-1] :] - times[before[-1]], sizes[before[-1] :] - sizes[before[-1]]
+        way = float(sizes[-1])
         if abs(way) < n.PACE_LEAST:
             return 0.0
-        line = (times - times[0]) / (times[-1] - times[0])
-        off = np.abs((sizes - sizes[0]) / way - line).max()
-        return abs(way) / float(times[-1] - times[0]) if off < n.PACE_BENDS else 0.0
+        off = np.abs(sizes / way - times / times[-1]).max()
+        return abs(way) / float(times[-1]) if off < n.PACE_BENDS else 0.0
 
     def add(self, over: Array) -> None:
         """One more scan of the change that nobody knows."""

@@ -14,7 +14,7 @@ from models.measurement.covariance.noise import NoiseModel
 from models.measurement.fit import LEAST_MEAN
 from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import TouchPrior
-from services.estimation.faults.board import BoardFaults, BoardView, Explanation, PredictedScan, as_they_stand
+from services.estimation.faults.board import BoardFaults, BoardView, Explanation, PredictedScan, standing_covariance
 from services.estimation.faults.contact_or_touch import ContactOrTouchTest
 from services.estimation.faults.wires import WireFault
 from services.estimation.hypotheses.hypotheses import Hypotheses
@@ -23,7 +23,7 @@ from services.estimation.touches import TouchTracks
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
-MakeQuestion = Callable[[Hypotheses, BoardView, Array], Innovation]
+MakeInnovation = Callable[[Hypotheses, BoardView, Array], Innovation]
 Selecting = Callable[[Hypotheses, Innovation], ScoredAnswer]
 Recounting = Callable[[Hypotheses, Innovation, ScoredAnswer], ScoredAnswer]
 
@@ -36,11 +36,11 @@ class FaultIsolation:
     ) -> None:
         self._tables, self._noise, self._touches = tables, noise, touches
         self._hypotheses, self._faults = hypotheses, faults
-        self._contact_doubt = ContactOrTouchTest(tables, hypotheses, faults)
+        self._contact_or_touch = ContactOrTouchTest(tables, hypotheses, faults)
         self._through: tuple[WireFault, Hypotheses] | None = None
 
     def __call__(
-        self, at: PredictedScan, innovation_of: MakeQuestion, selecting: Selecting, recounting: Recounting
+        self, at: PredictedScan, innovation_of: MakeInnovation, selecting: Selecting, recounting: Recounting
     ) -> Explanation:
         """innovation_of: of hypotheses, a view and a covariance; selecting: the likeliest touches of an innovation;
         recounting: rather others than those of an answer.
@@ -52,11 +52,11 @@ class FaultIsolation:
         def rewired(view: BoardView) -> bool:
             if not faults.suspects_wires(view):
                 return False
-            touched, _ = self._change(standing, at)
+            touched, _ = self._standing_change(standing, at)
             return faults.wires_changed(view, touched, skin + self._hypotheses.inflated_drift(), own)
 
         def asked(view: BoardView) -> Explanation:
-            hypotheses = self._seen(view)
+            hypotheses = self._through_wires(view)
             innovation = innovation_of(hypotheses, view, view.covariance(skin, own))
             return Explanation(view, innovation, recounting(hypotheses, innovation, selecting(hypotheses, innovation)))
 
@@ -71,7 +71,7 @@ class FaultIsolation:
         if faults.now.opens and faults.now.wire is None and (odd or (at.whole and self._touches.in_doubt)):
             found = self._lifted(found, lambda: asked(faults.look(at)))
         if faults.asks(found.answer):
-            found = self._changed(found, at, *self._change(standing, at), selecting)
+            found = self._faulty(found, at, *self._standing_change(standing, at), selecting)
         if not found.answer.nearly_holds:  # what does not explain its scan would stand beside any touch in the next one
             faults.now.wire, faults.now.wire_since_s = before
         return self._doubted(found, at)
@@ -89,12 +89,10 @@ class FaultIsolation:
         now.lifted = before
         return found
 
-    def _changed(
+    def _faulty(
         self, found: Explanation, at: PredictedScan, touched: Array, nearby: Array, selecting: Selecting
     ) -> Explanation:
-        hypotheses = self._seen(found.view)
-
-        fit = found.answer.fit
+        hypotheses, fit = self._through_wires(found.view), found.answer.fit
         likely = () if fit is None else begun_as(fit, at.span_s)
 
         def ask(other: Innovation) -> ScoredAnswer:
@@ -111,17 +109,16 @@ class FaultIsolation:
         """
         if self._faults.now.wire is not None or not at.whole:
             return found
+        doubtful = _doubtful(found.answer)
         for k, track in enumerate(self._touches.now.tracks):
-            asked = track.contact_due or track.weakened or _doubtful(found.answer)
-            if track.told_from_contact and not _doubtful(found.answer):
-                continue
-            if not asked or track.ended or not self._faults.on_electrode(track.state):
+            due = (track.contact_due or track.weakened) and not track.told_from_contact
+            if not (due or doubtful) or track.ended or not self._faults.on_electrode(track.state):
                 continue
             standing = self._touches.expected(at)
             loose = self._touches.expected(at, manoeuvring=True)
             del standing[k], loose[k]
-            touched, nearby = self._change(standing, at, but=k)
-            ask = partial(self._with, standing, loose)
+            touched, nearby = self._standing_change(standing, at, but=k)
+            ask = partial(self._given, standing, loose)
             other = self._faults.explained_by_fault(found, touched, nearby, ask, doubted=track.state)
             if other is not None:
                 self._touches.remove(k)
@@ -138,9 +135,9 @@ class FaultIsolation:
         if not self._faults.now.doubt.undecided or self._faults.now.wire is not None:
             return
         skin, own = self._covariances(at)
-        touched, nearby = self._change(self._touches.expected(at), at)
+        touched, nearby = self._standing_change(self._touches.expected(at), at)
         misfit = self._tables.misfit_of(float(touched @ touched))
-        touch = self._contact_doubt(found, skin + nearby + misfit, own)
+        touch = self._contact_or_touch(found, skin + nearby + misfit, own)
         if touch is not None:
             self._faults.drop_contact()
             self._touches.tell(touch, at)
@@ -155,12 +152,12 @@ class FaultIsolation:
         flicker = (contact * self._noise.now.flicker) @ contact.T
         return at.predicted.covariance + flicker, self._noise.covariance(at.scan.part) - flicker
 
-    def _with(self, standing: list[TouchPrior], loose: list[TouchPrior], innovation: Innovation) -> ScoredAnswer:
-        if standing:
-            return self._hypotheses.ask(replace(innovation, candidates=(), places=()), standing, loose)
-        return self._hypotheses.untouched(innovation)
+    def _given(self, standing: list[TouchPrior], loose: list[TouchPrior], innovation: Innovation) -> ScoredAnswer:
+        if not standing:
+            return self._hypotheses.untouched(innovation)
+        return self._hypotheses.ask(replace(innovation, candidates=(), places=()), standing, loose)
 
-    def _change(self, priors: Sequence[TouchPrior], at: PredictedScan, but: int = -1) -> tuple[Array, Array]:
+    def _standing_change(self, priors: Sequence[TouchPrior], at: PredictedScan, but: int = -1) -> tuple[Array, Array]:
         """(K,) what touches that stand do to each |Z|, and (K, K) the covariance of what they may have changed by: a
         strong one's outline and misfit are more than a contact impedance that begins to change. But: a track that is
         left out. The outline of a touch that has just come is not known: what is odd about it is no contact.
@@ -172,7 +169,7 @@ class FaultIsolation:
         course = TouchCourse(self._tables.response, at.times_s, at.span_s)
         columns = course.columns(states, priors, course.directions(states))
         known = [t.scans >= n.DOUBT_SCANS for k, t in enumerate(self._touches.now.tracks) if k != but]
-        nearby = as_they_stand(columns.slopes, states)
+        nearby = standing_covariance(columns.slopes, states)
         if not all(known):
             return np.maximum(columns.mean, LEAST_MEAN), nearby
         outlines = columns.shapes * np.concatenate([prior.shape_sd for prior in priors])
@@ -180,7 +177,7 @@ class FaultIsolation:
         nearby += outlines @ outlines.T + self._tables.misfit_of(float(change @ change))
         return np.maximum(change, LEAST_MEAN), nearby
 
-    def _seen(self, view: BoardView) -> Hypotheses:
+    def _through_wires(self, view: BoardView) -> Hypotheses:
         """The skin through what is wrong with the board's wires."""
         wire = self._faults.now.wire
         if wire is None or view.slopes is None:

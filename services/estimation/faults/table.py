@@ -1,4 +1,4 @@
-"""One table of closed-form log evidence: nothing wrong, faster drift, a disturbance, against every fault of the board.
+"""Closed-form log evidence of the state of the board's wires: sound, or any fault that the pattern can tell.
 
 A fault may begin within the scan: measurements before its onset are as they were. Touches that nobody knows yet go into
 the covariance, as any touches anywhere, so that a fault is told under a touch that begins with it.
@@ -15,14 +15,14 @@ from models.measurement.covariance.whitening import Whitening
 from models.measurement.numbers import TYPICAL_DROP
 from models.measurement.responses.response import DiscGrid
 from models.measurement.touch import area_of
+from services.estimation.faults.impedance import MOST_LOG
 from services.estimation.faults.wires import WireFault, WireMaps, blinded
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-ROUGHLY = 5  # changes that are looked at exactly
-MOST_LOG = 3.0  # of a residual: beyond, nothing is told any more
+CANDIDATES = 5  # changes that are looked at exactly
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,6 @@ class BoardScan:
     failed: Mask  # (K,) no value, or one that is none
     known: Mask  # (K,) the baseline has it: the others tell nothing
     times_s: Array  # (K,) from the middle of the scan
-    span_s: float
 
 
 @dataclass(frozen=True)
@@ -77,18 +76,18 @@ class WireTable:
         blind[0] = False
         left = np.where(scan.failed | blind | ~scan.known, 0.0, scan.log_z - np.log(np.maximum(values, 1e-9)))
         left = np.clip(left, -MOST_LOG, MOST_LOG)
-        told = np.where(scan.failed & blind, n.LOG_PRIOR_EXPECTED_FAILURE, 0.0)
-        told += np.where(scan.failed ^ blind, n.LOG_PRIOR_FAILURE, 0.0)
-        told[:, ~scan.known] = 0.0
+        log_prior = np.where(scan.failed & blind, n.LOG_PRIOR_EXPECTED_FAILURE, 0.0)
+        log_prior += np.where(scan.failed ^ blind, n.LOG_PRIOR_FAILURE, 0.0)
+        log_prior[:, ~scan.known] = 0.0
         before = 0 if standing is None else 1 + self._maps.at[standing]
         found = list[WireGuess]()
         slopes_before = self._slopes(before, z0)
-        for which, onset_s in self._roughly(scan, left, told, before):
+        for which, onset_s in self._candidates(scan, left, log_prior, before):
             after = scan.times_s >= onset_s
             slopes = np.where(after[:, None], self._slopes(which, z0), slopes_before)
             white = Whitening.of(own + slopes @ skin @ slopes.T)
             residual = np.where(after, left[which], left[before])
-            prior = float(np.where(after, told[which], told[before]).sum()) + _cost(before, which)
+            prior = float(np.where(after, log_prior[which], log_prior[before]).sum()) + _log_prior(before, which)
             fault = self._maps.faults[which - 1] if which else None
             found.append(WireGuess(fault, onset_s, white.log_likelihood(residual) + prior))
         return sorted(found, key=lambda guess: -guess.score)
@@ -96,21 +95,20 @@ class WireTable:
     def _slopes(self, which: int, z0: Array) -> Array:
         return np.eye(len(z0)) if not which else self._maps.one(self._maps.faults[which - 1], z0).slopes
 
-    def _roughly(self, scan: BoardScan, left: Array, told: Array, before: int) -> list[tuple[int, float]]:
+    @staticmethod
+    def _candidates(scan: BoardScan, left: Array, log_prior: Array, before: int) -> list[tuple[int, float]]:
         """The likeliest changes of state by the misfit of each measurement for itself, and no change."""
-        cost = np.minimum(np.abs(left) / n.FALLS, n.MISFIT_MOST) - told
+        cost = np.minimum(np.abs(left) / n.FALLS, n.MISFIT_MOST) - log_prior
         order = np.argsort(scan.times_s)
         gained = (cost - cost[before])[:, order]
         since = np.cumsum(gained[:, ::-1], axis=1)[:, ::-1]  # if it began with that measurement
         since[before] = np.inf
         first = since.argmin(axis=1)
-        likeliest = np.argsort(since[np.arange(len(first)), first])[:ROUGHLY]
+        likeliest = np.argsort(since[np.arange(len(first)), first])[:CANDIDATES]
         onsets_s = np.where(first == 0, -np.inf, scan.times_s[order[first]])
         return [(before, -np.inf), *((int(which), float(onsets_s[which])) for which in likeliest)]
 
 
-def _cost(before: int, after: int) -> float:
+def _log_prior(before: int, after: int) -> float:
     """Log prior of a change of state, 0 being sound wires."""
-    if before == after:
-        return 0.0
-    return float(n.LOG_PRIOR_WIRE if not before or not after else 2 * n.LOG_PRIOR_WIRE)
+    return n.LOG_PRIOR_WIRE * ((before > 0) + (after > 0)) if before != after else 0.0

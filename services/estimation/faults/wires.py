@@ -10,11 +10,9 @@ Touches and drift go through the slopes, so that they are found under the fault 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +49,6 @@ class WireFault:
 class WireMap:
     """A frame through a fault, about one untouched frame."""
 
-    fault: WireFault
     values: Array  # (K,) |Z| of the untouched skin
     slopes: Array  # (K, K) of log |Z| through the fault to log |Z| without it; rows of 0: they see nothing
     blind: Mask  # (K,) measurements that the fault leaves next to nothing of
@@ -62,6 +59,7 @@ class WireMaps:
 
     def __init__(self, pattern: NDArray[np.integer]) -> None:
         self.faults: list[WireFault] = []
+        self.at: dict[WireFault, int] = {}  # place of each in `faults`
         self.knows = all_pairs(pattern)
         if not self.knows:
             return
@@ -74,16 +72,15 @@ class WireMaps:
         self._joined = np.array([self._place[couple] for couple in couples])
         between = [self._terms(first, second, np.full_like(first, a), np.full_like(second, b)) for a, b in couples]
         self._between = np.array(between)
-        stuck = _stuck_bits(electrodes)
+        stuck = list[WireFault]()
+        for side, bit, value in product(SIDES, range((electrodes - 1).bit_length()), (0, 1)):
+            missed = tuple(e for e in range(electrodes) if (e >> bit & 1) != value)
+            stuck.append(WireFault(WireKind.STUCK, missed, side, bit, value))
         self._routed = np.array([self._of_stuck(first, second, fault) for fault in stuck])
         self.faults = [WireFault(WireKind.EXCHANGED, couple) for couple in couples]
         self.faults += [WireFault(WireKind.SHORT, couple) for couple in couples]
         self.faults += stuck
-
-    @cached_property
-    def at(self) -> dict[WireFault, int]:
-        """Place of each fault in `faults`."""
-        return {fault: k for k, fault in enumerate(self.faults)}
+        self.at = {fault: k for k, fault in enumerate(self.faults)}
 
     def every(self, z0: Array) -> Array:
         """(N, K) |Z| through each of the N faults, of a skin that has z0 (K,) without them."""
@@ -100,20 +97,17 @@ class WireMaps:
         """Raises KeyError for a fault that this pattern cannot tell."""
         k, couples = self.at[fault], len(self._joined)
         if k < couples:
-            values, slopes = self._exchange(self._exchanged[k], z0)
+            values, slopes = z0[self._exchanged[k]], np.eye(len(z0))[self._exchanged[k]]
         elif k < 2 * couples:
             values, slopes = self._short(k - couples, z0)
         else:
-            values, slopes = self._stuck(self._routed[k - 2 * couples], z0)
+            terms = self._routed[k - 2 * couples]
+            signed = _combined(np.append(z0, 0.0), terms)
+            values, slopes = np.abs(signed), _slopes(terms) * np.sign(signed)[:, None]
         blind = blinded(values[None], z0)[0]
         relative = slopes * z0 / np.where(blind, 1.0, values)[:, None]
         relative[blind] = 0.0
-        return WireMap(fault, values, relative, blind)
-
-    def _exchange(self, places: Indices, z0: Array) -> tuple[Array, Array]:
-        slopes = np.zeros((len(z0), len(z0)))
-        slopes[np.arange(len(z0)), places] = 1.0
-        return z0[places], slopes
+        return WireMap(values, relative, blind)
 
     def _short(self, k: int, z0: Array) -> tuple[Array, Array]:
         passed = _combined(np.append(z0, 0.0), self._between[k])
@@ -123,10 +117,6 @@ class WireMaps:
         slopes[:, joined] += (passed / ohm) ** 2
         return z0 - passed**2 / ohm, slopes
 
-    def _stuck(self, terms: Indices, z0: Array) -> tuple[Array, Array]:
-        signed = _combined(np.append(z0, 0.0), terms)
-        return np.abs(signed), _slopes(terms) * np.sign(signed)[:, None]
-
     def _of_exchanged(self, first: Indices, second: Indices, couple: tuple[int, int]) -> Indices:
         wires = np.arange(int(second.max()) + 1)
         wires[list(couple)] = couple[::-1]
@@ -134,15 +124,12 @@ class WireMaps:
 
     def _of_stuck(self, first: Indices, second: Indices, fault: WireFault) -> Indices:
         """The pair is driven, and sensed, as it is meant, by one of them from another electrode."""
-        mask = 1 << fault.bit
-        driven = [first.copy(), second.copy()]
-        column = SIDES.index(fault.side)
-        driven[column] = driven[column] | mask if fault.value else driven[column] & ~mask
-        electrodes = len(self._place) - 1
-        reached = np.minimum(driven[column], electrodes)  # beyond the last one nothing is connected
-        driven[column] = reached
-        terms = self._terms(first, second, driven[0], driven[1])
-        terms[reached == electrodes] = len(first)
+        column, mask, electrodes = SIDES.index(fault.side), 1 << fault.bit, len(self._place) - 1
+        driven = [first, second]
+        reached = driven[column] | mask if fault.value else driven[column] & ~mask
+        driven[column] = np.minimum(reached, electrodes)  # beyond the last one nothing is connected
+        terms = self._terms(first, second, *driven)
+        terms[driven[column] == electrodes] = len(first)
         return terms
 
     def _terms(self, p: Indices, q: Indices, r: Indices, s: Indices) -> Indices:
@@ -173,9 +160,9 @@ def blinded(values: Array, z0: Array) -> Mask:
     return np.asarray(values < n.NEXT_TO_NOTHING * np.median(z0))
 
 
-def open_electrodes(failed: Mask, member: Mask) -> tuple[tuple[int, ...], Mask]:
-    """Electrodes by which most failed measurements are explained, the one that explains most first, and what is left
-    of the failures (K,). failed (K,), member (K, E): the measurement uses the electrode.
+def open_electrodes(failed: Mask, member: Mask) -> tuple[int, ...]:
+    """Electrodes by which most failed measurements are explained, chosen from the one that explains most on. failed
+    (K,); member (K, E): the measurement uses the electrode.
     """
     left, gone, found = failed.copy(), np.zeros_like(failed), list[int]()
     while left.any():
@@ -187,7 +174,7 @@ def open_electrodes(failed: Mask, member: Mask) -> tuple[tuple[int, ...], Mask]:
         found.append(worst)
         gone |= member[:, worst]
         left &= ~gone
-    return tuple(sorted(found)), left
+    return tuple(sorted(found))
 
 
 def members(pattern: NDArray[np.integer]) -> Mask:
@@ -202,13 +189,3 @@ def all_pairs(pattern: NDArray[np.integer]) -> bool:
     themselves = bool((pattern[:, 0] == pattern[:, 2]).all() and (pattern[:, 1] == pattern[:, 3]).all())
     pairs = {frozenset(row) for row in pattern[:, :2].tolist()}
     return themselves and len(pairs) == len(pattern) == electrodes * (electrodes - 1) // 2
-
-
-def _stuck_bits(electrodes: int) -> Sequence[WireFault]:
-    found = list[WireFault]()
-    for side in SIDES:
-        for bit in range((electrodes - 1).bit_length()):
-            for value in (0, 1):
-                missed = tuple(e for e in range(electrodes) if (e >> bit & 1) != value)
-                found.append(WireFault(WireKind.STUCK, missed, side, bit, value))
-    return found

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from math import gcd
 from typing import NamedTuple
 
@@ -36,7 +37,7 @@ Array = NDArray[np.float64]
 LADDER: Array = 2.0 ** np.arange(n.START_RUNGS)  # of the difference between bundle and skin
 COARSE = 12  # pixels along each side of the sheet, that a smooth field is made of
 SPAN_S = 1.0  # of a mean of scans, in which nothing changes: any
-HELD = 1e-6  # rates and velocities of a touch that lasts through all scans
+STEADY_SD = 1e-6  # of rates and velocities of a touch that lasts through all scans
 
 
 class StartSays(Enum):
@@ -70,18 +71,12 @@ class JudgedStart:
     def judgements(self) -> list[Judgement]:
         """Whether something touches, and whether something may without being seen."""
         if self.bare is None:
-            return [
-                Judgement("start", 0.0, float(n.START_NATS), 0.0, Verdict.CANNOT),
-                judge("hidden", 1.0, 1.0),
-            ]
+            return [Judgement("start", 0.0, float(n.START_NATS), 0.0, Verdict.CANNOT), judge("hidden", 1.0, 1.0)]
         touched = judge("start", self.odds, n.START_NATS)
         if self.says is StartSays.TOUCHED:
             return [touched]
         hides = float(n.FALSE_ALARM_Z2) / max(self.bare.seen, 1e-9)
         return [touched, judge("hidden", max(hides, 1 + self.odds / n.START_NATS), 1.0)]
-
-
-CANNOT = JudgedStart(StartSays.UNKNOWN, 0.0, False, None, None)
 
 
 @dataclass(frozen=True)
@@ -105,7 +100,7 @@ class TouchAtStartTest:
     ) -> JudgedStart:
         """log_z (K,): mean of the first scans; variance (K,): of that mean; live (K,): what of it counts."""
         if live.mean() < n.LEAST_LIVE or (earlier is None and not self._tables.predicted):
-            return CANNOT
+            return JudgedStart(StartSays.UNKNOWN, 0.0, False, None, None)
         log_expected = np.log(self._tables.z0) if earlier is None else earlier.log_z0
         y = log_z - log_expected
         gain = float(np.median(y[live]))
@@ -114,12 +109,11 @@ class TouchAtStartTest:
         base = np.diag(variance + n.START_ABSOLUTE**2) + n.START_GAIN**2
         leave_out(base, live)
         ladder = StartLadder(tables, y, live)
-        rest = n.START_ABSOLUTE**2 * np.eye(len(y))
         if earlier is not None:
-            return decided(ladder.rungs(base + earlier.covariance, rest, 0.0))
+            return decided(ladder.rungs(base + earlier.covariance, n.START_ABSOLUTE**2 * np.eye(len(y)), 0.0))
         contact = tables.contact * n.START_CONTACT
         base += contact @ contact.T
-        form = n.START_LAYER**2 * tables.layer @ tables.layer.T + rest
+        form = bundle_misfit(tables)
         wide = base + n.START_FIELD**2 * smooth_field(tables) + n.START_GRAIN**2 * grain(tables)
         return decided(ladder.rungs(base, form, 0.0) + ladder.rungs(wide, form, float(n.START_COST_WIDE)))
 
@@ -141,23 +135,21 @@ class StartLadder:
         whites = [Whitening.of(covariance) for covariance in covariances]
         density = [white.log_likelihood(self._y) for white in whites]
         last = min(len(LADDER), int(np.argmax(density)) + 2)
-        found = list[Rung]()
-        most = -np.inf
+        found, touched, most = list[Rung](), -np.inf, -np.inf
         for k in range(last):
-            nothing = bool(found) and found[-1].touched < most - n.START_PAST
-            found.append(self._rung(float(LADDER[k]), covariances[k], whites[k], density[k], cost, nothing))
-            most = max(most, found[-1].touched)
+            past = touched < most - n.START_PAST
+            found.append(self._rung(float(LADDER[k]), covariances[k], whites[k], density[k], cost, past))
+            touched = found[-1].touched
+            most = max(most, touched)
         return found
 
-    def _rung(
-        self, times: float, covariance: Array, white: Whitening, density: float, cost: float, nothing: bool
-    ) -> Rung:
-        """nothing: whether no touch is worth looking for any more."""
+    def _rung(self, times: float, covariance: Array, white: Whitening, density: float, cost: float, past: bool) -> Rung:
+        """past: whether no touch is worth looking for any more."""
         log_prior = cost - float(np.log(times))  # the larger, the less likely
         information = self._grid.information(white)
         least = float(n.START_SEEN**2 * np.quantile(information, n.START_SEEN_SHARE))
         scene = FittedScan(self._y, covariance, self._course, self._misfit, int(self._live.sum()))
-        fit = None if nothing else self._touched(scene, white, information)
+        fit = None if past else self._touched(scene, white, information)
         touched = -np.inf if fit is None else fit.evidence + n.LOG_PRIOR_TOUCH * len(fit) + log_prior
         return Rung(times, cost == 0, density + log_prior, touched, least, fit)
 
@@ -171,7 +163,9 @@ class StartLadder:
             if z2 < n.FALSE_ALARM_Z2:
                 break
             x, y = self._grid.discs[disc, PLACE]
-            priors = [*priors, held(float(x), float(y), action)]
+            prior = anywhere(float(x), float(y), action, SPAN_S)
+            prior.sd[RATE:] = STEADY_SD
+            priors = [*priors, prior]
             fit = TouchFitter(scene, priors, self._error).fit(int(n.STEPS_COLD))
             if best is not None and fit.evidence < best.evidence + n.ANOTHER:
                 break
@@ -196,26 +190,23 @@ def grain(tables: SkinTables) -> Array:
     return np.asarray(columns @ columns.T)
 
 
-def held(x: float, y: float, action: float) -> TouchPrior:
-    """A touch anywhere that stays as it is."""
-    prior = anywhere(x, y, action, SPAN_S)
-    prior.sd[RATE:] = HELD
-    return prior
+def bundle_misfit(tables: SkinTables) -> Array:
+    """(K, K) covariance of log |Z| over the least difference between a skin and its bundle."""
+    series = n.START_SERIES**2 * tables.series @ tables.series.T
+    return np.asarray(series + n.START_ABSOLUTE**2 * np.eye(len(series)))
 
 
 def decided(rungs: list[Rung]) -> JudgedStart:
     untouched = np.array([rung.untouched for rung in rungs])
     touched = np.array([rung.touched for rung in rungs])
-    whole = float(np.logaddexp.reduce(touched))
-    odds = whole - float(np.logaddexp.reduce(untouched))
+    odds = float(np.logaddexp.reduce(touched)) - float(np.logaddexp.reduce(untouched))
     bare = rungs[int(untouched.argmax())]
     best = rungs[int(touched.argmax())]
     if odds > n.START_NATS and best.fit is not None:
         sure = best.even and best.times <= n.START_SURE and best.fit.chi2 < n.START_SURE_CHI2
         return JudgedStart(StartSays.TOUCHED, odds, sure, bare, best.fit)
-    if odds < 0 and bare.seen > n.FALSE_ALARM_Z2:
-        return JudgedStart(StartSays.UNTOUCHED, odds, False, bare, None)
-    return JudgedStart(StartSays.UNKNOWN, odds, False, bare, None)
+    says = StartSays.UNTOUCHED if odds < 0 and bare.seen > n.FALSE_ALARM_Z2 else StartSays.UNKNOWN
+    return JudgedStart(says, odds, False, bare, None)
 
 
 class WiringTest:
@@ -224,7 +215,16 @@ class WiringTest:
     def __init__(self, tables: SkinTables) -> None:
         self.maps = WireMaps(tables.pattern)
         self._tables, self._table = tables, WireTable(self.maps)
-        self._covariances: list[Array] = []  # (K, K) of an untouched or touched skin, for differences of each size
+
+    @cached_property
+    def _covariances(self) -> list[Array]:
+        """(K, K) of log |Z| over what a skin and its bundle differ by, of each size, and touches anywhere."""
+        tables = self._tables
+        contact = tables.contact * n.START_CONTACT
+        base = contact @ contact.T + n.START_GAIN**2 + any_touches(tables.grid)
+        base += n.START_FIELD**2 * smooth_field(tables) + n.START_GRAIN**2 * grain(tables)
+        form = bundle_misfit(tables)
+        return [base + times**2 * form for times in LADDER]
 
     def __call__(self, log_z: Array, variance: Array, live: NDArray[np.bool_]) -> WireFault | None:
         """log_z (K,): mean of the first scans; variance (K,): of that mean; live (K,): what of it counts."""
@@ -232,34 +232,17 @@ class WiringTest:
             return None
         expected = np.log(self._tables.z0)
         predicted = expected + float(np.median((log_z - expected)[live]))
-        times_s = np.zeros(len(log_z))
-        scan = BoardScan(np.where(live, log_z, 0.0), predicted, ~live, np.ones_like(live), times_s, 1.0)
+        at_once = np.zeros(len(log_z))
+        scan = BoardScan(np.where(live, log_z, 0.0), predicted, ~live, np.ones_like(live), at_once)
         if not self._table.suspicious(scan, None):
             return None
-        if not self._covariances:
-            self._covariances = covariances(self._tables)
         own = np.diag(np.where(live, variance, 1.0))
         best = dict[WireFault | None, float]()
         for times, covariance in zip(LADDER, self._covariances, strict=True):
             for guess in self._table.guesses(scan, None, covariance, own):
                 score = guess.score - float(np.log(times))
                 best[guess.fault] = max(best.get(guess.fault, -np.inf), score)
-        return likeliest(best)
-
-
-def likeliest(score: dict[WireFault | None, float]) -> WireFault | None:
-    """The fault that is surely likelier than sound wires and than every other."""
-    first, *others = sorted(score, key=lambda fault: -score[fault])
-    if first is None or score[first] < score[None] + n.WIRE_SURE:
-        return None
-    apart = all(score[first] > score[other] + n.WIRE_APART for other in others)
-    return first if apart else None
-
-
-def covariances(tables: SkinTables) -> list[Array]:
-    """(K, K) of log |Z| over what a skin and its bundle differ by, of each size, and touches anywhere."""
-    contact = tables.contact * n.START_CONTACT
-    base = contact @ contact.T + n.START_GAIN**2 + any_touches(tables.grid)
-    base += n.START_FIELD**2 * smooth_field(tables) + n.START_GRAIN**2 * grain(tables)
-    form = n.START_LAYER**2 * tables.layer @ tables.layer.T + n.START_ABSOLUTE**2 * np.eye(len(base))
-    return [base + times**2 * form for times in LADDER]
+        first, *others = sorted(best, key=lambda fault: -best[fault])
+        surely = first is not None and best[first] >= best[None] + n.WIRE_SURE
+        apart = all(best[first] > best[other] + n.WIRE_APART for other in others)
+        return first if surely and apart else None
