@@ -135,7 +135,8 @@ class ScanStep:
         covariance = skin.noise.covariance(measured.scan.part) + predicted.covariance
         covariance += then.inflated_process_noise(n.SLOW_TIMES)
         leave_out(covariance, measured.live)
-        y = np.where(measured.live, measured.log_z - skin.log_z0 - predicted.shift, 0.0)
+        y = skin.faults.taken_off(measured.log_z - skin.log_z0 - predicted.shift)
+        y = np.where(measured.live, y, 0.0)
         information = skin.hypotheses.grid.information(Whitening.of(covariance))
         innovation = Innovation(*measured.fields, y, covariance, information)
         answer = skin.hypotheses.slow_onset(innovation)
@@ -166,6 +167,7 @@ class ScanStep:
         skin, measured = self.skin, self.measured
         self._explained(AS_IT_IS)
         skin.remember(skin.refused.explained(measured.oldest_s))
+        skin.faults.remember(seen.y, measured.whole)
         if measured.whole:
             log_z = skin.log_z0 + skin.faults.taken_off(measured.log_z - skin.log_z0)
             self.measured = replace(measured, log_z=log_z)

@@ -141,6 +141,7 @@ class TaredSkin:
         made.hypotheses.process_noise_scale = self.hypotheses.process_noise_scale
         made.hypotheses.wide = self.hypotheses.wide
         made.drift.succeed(self.drift)
+        made.aged = self.aged
         return made
 
     def remember(self, memories: Sequence[Memory]) -> None:

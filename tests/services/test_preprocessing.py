@@ -14,6 +14,7 @@ from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA, JudgementsFrame, RawFrame, pack, unpack
 from services.describe import EVERY_S, MOVED
+from services.estimation.by_bundle import skin_tables
 from services.estimation.faults import checks
 from services.estimation.initialisation.baseline import Baseline, NoBaseline, agreement, take
 from services.estimation.initialisation.start import JudgedStart, StartSays, TouchAtStartTest
@@ -39,6 +40,13 @@ def not_believed(frame: RawFrame, reason: str) -> RawFrame:
 
 def left_out(sigma: np.ndarray) -> list[int]:
     return np.flatnonzero(~np.isfinite(sigma)).tolist()
+
+
+def test_a_calibration_may_be_ready_before_the_first_scan_of_a_kept_baseline(tared: Fed) -> None:
+    preprocessing = tared.stage
+    preprocessing.set_baseline(preprocessing.baseline, age_s=600.0)
+    preprocessing.estimator.use(skin_tables(preprocessing.bundle))
+    assert all(out.valid and not out.touched for out in tared.feel(scans=5))
 
 
 def test_no_false_touch_and_the_lightest_touch_is_seen(tared: Fed, board: Board) -> None:

@@ -63,6 +63,8 @@ class FaultState:
     gross_since_s: float = np.inf  # no sound board's gain is as this one since then; inf: it is
     unexplained_scans: int = 0
     doubt: ContactState = field(default_factory=ContactState)  # of the changed contact
+    earlier: Annotated[Array | None, "K"] = None  # what was left of log |Z| two full scans before what is in doubt
+    before: Annotated[Array | None, "K"] = None  # in the scan before: it may have begun in it
 
 
 @dataclass(frozen=True)
@@ -457,6 +459,7 @@ class BoardFaults:
                 self._revert_gain()
             return
         now.unexplained_scans = 0
+        self.remember(answer.residual, whole)
         if now.contact < 0:
             return
         self._update_size(view, answer)
@@ -478,6 +481,11 @@ class BoardFaults:
             # One scan's size is off by its noise, and nothing would take that back.
             now.size = home if back or now.doubt.stays(home) else now.doubt.lately(view.at.middle_s)
             self._settle()
+
+    def remember(self, residual: Array, whole: bool) -> None:
+        """(K,) what is left of log |Z| in a scan that is explained."""
+        if whole and not self.now.doubt.undecided:
+            self.now.earlier, self.now.before = self.now.before, residual
 
     def gain_holds(self, end_s: float) -> None:
         """A scan that ends then is explained for sure with the gain as it is."""

@@ -2,7 +2,8 @@
 
 The scans since the change are averaged, touches that stand taken off, and both are asked: a contact of any size, and a
 touch there with what discs miss of it at second order. A touch has more figures, so a light one is worth up to 18 nats
-less than a contact that is none; a contact that is one gains with each scan. What neither decides stays not valid.
+less than a contact that is none; a contact that is one gains with each scan. Where the touch would be too light to be
+seen elsewhere, less decides for a contact that jumped from one scan to the next. What neither decides stays not valid.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from models.measurement.covariance.whitening import leave_out
 from models.measurement.fit import FoundTouches
 from models.measurement.responses.tables import SkinTables
+from models.measurement.touch import ACTION
 from services.estimation.faults.board import LEAST, BoardFaults, BoardView, Explanation
 from services.estimation.faults.impedance import Change, Unexplained
 from services.estimation.hypotheses.hypotheses import Hypotheses
@@ -24,6 +26,8 @@ from services.estimation.values import numbers as n
 Array = NDArray[np.float64]
 
 EVERY = 16  # scans from asking to asking, once those since the change have doubled so often: at 2, 4, 8, 16, 32, 48 ...
+JUMP = 0.3  # of a change that jumped: so much at most was there before, or came later; a press that takes six scans and
+# more has more of both, chosen on presses of 0.1 N on electrodes that take 1 to 20 scans
 SETTLES = 3  # whole scans in which a change may go on
 
 
@@ -60,7 +64,8 @@ class ContactOrTouchTest:
             return None
         touch = self._touch(asked)
         odds = contact.score - touch.score
-        if odds > n.CONTACT_TOLD:
+        jumped = odds > n.FAULT_SURE and self._jumped(asked, contact) and _unseen(found.innovation, touch)
+        if odds > n.CONTACT_TOLD or jumped:
             doubt.end(faults.size)
         elif odds < -n.FAULT_SURE and touch.explained:
             return touch.fit
@@ -75,6 +80,19 @@ class ContactOrTouchTest:
             return True
         sizes = [each.size for each in doubt.sizes[-2:]]
         return doubt.seen <= SETTLES and len(sizes) == 2 and abs(sizes[1] - sizes[0]) > doubt.least
+
+    def _jumped(self, asked: Innovation, contact: Change) -> bool:
+        """Whether all of the change came from one scan to the next, and stays as it came: a press rises, or is lighter
+        than what the skin shows.
+        """
+        faults = self._faults.now
+        if faults.earlier is None or faults.doubt.seen < 2:
+            return False
+        before = self._contact(replace(asked, y=np.where(asked.live, faults.earlier, 0.0))).size
+        sizes = [each.size for each in faults.doubt.sizes[-faults.doubt.seen :]]
+        half = len(sizes) // 2
+        later = float(np.mean(sizes[half:]) - np.mean(sizes[:half]))
+        return max(abs(before), abs(later)) < JUMP * contact.size
 
     def _over(self, view: BoardView, answer: ScoredAnswer) -> Array:
         """(K,) log |Z| over a skin with what is decided, touches that stand taken off."""
@@ -95,3 +113,10 @@ class ContactOrTouchTest:
         columns = self._faults.columns
         second = n.TOUCH_SECOND * np.column_stack([columns.series[:, k], columns.shunt[:, k]])
         return self._hypotheses.on_electrode(asked, self._tables.places[k], second)
+
+
+def _unseen(innovation: Innovation, touch: ScoredAnswer) -> bool:
+    """Whether a touch acts by so little that at many places no scan would show it."""
+    assert touch.fit is not None
+    least = float(np.quantile(innovation.information, n.START_SEEN_SHARE))
+    return float(touch.fit.states[0, ACTION]) ** 2 * least < n.FALSE_ALARM_Z2
