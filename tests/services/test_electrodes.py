@@ -8,7 +8,17 @@ import pytest
 from models.shapes import Shape
 from protocol.errors import EitskinError
 from services.pipeline import Result
-from tests.services.stub_skin import SCAN_S, StubSkin, lasting, off_m, present, sheet, states, transfer
+from tests.services.stub_skin import (
+    SCAN_S,
+    TARE_SCANS,
+    StubSkin,
+    lasting,
+    off_m,
+    present,
+    sheet,
+    states,
+    transfer,
+)
 
 PRESS = (Shape("circle", 0.3, -0.2, 0.25, 0.3),)
 NAMED_WITHIN = 3  # frames
@@ -188,6 +198,20 @@ def on_electrode(electrode: int, inside: float, along: float, radius: float, dro
     out = np.where(np.abs(place) > 0.99, np.sign(place), 0.0)
     x, y = place - inside * out + along * out[::-1]
     return Shape("circle", float(x), float(y), radius, drop)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_contacts_that_jump_while_the_first_scans_come_hold_no_baseline_up(steps: int) -> None:
+    skin, rng = StubSkin(tare=False), np.random.default_rng(2)
+    electrodes, up = np.array([3, 9, 14]), np.zeros(3, bool)
+    for k in range(2 * TARE_SCANS):
+        up[rng.integers(3)] ^= k % (20 // steps) == 0
+        jumped = tuple((int(electrode), 1.02) for electrode in electrodes[up])
+        result = skin.feel((), jumped)
+        assert not present(result)
+    assert result.contact.valid
+    pressed = skin.felt(6, PRESS, jumped)
+    assert pressed[-1].contact.valid and off_m(pressed[-1], PRESS[0]) < 1e-3
 
 
 @pytest.mark.parametrize("times", [1.02, 1.05])

@@ -124,6 +124,7 @@ TARE_HARMLESS = Number(5e-5, "-", "change within them that does no harm", "deriv
 TARE_NOISY = Number(0.05, "-", "noise beyond which no touch could be told", "chosen: the weakest touches' change")
 TARE_UNTRAINED = Number(0.0056, "-", "noise beyond which no network was trained", "derived: 45 dB, models/augmentation")
 TARE_DRIFTS = Number(3e-3, "-", "log conductivity, change while they come", "derived: a degree in 3 s")
+TARE_JUMPS = Number(0.03, "-", "of a contact impedance, while they come", "chosen: a touch of 0.03 N on an electrode")
 AGES = (
     Number(0.0, "-", "of a baseline's age, that its skin has drifted by: as if just taken", "derived: the least"),
     Number(0.1, "-", "the same: a tenth as far as its rates say", "derived: half way, in decades, to noise"),
