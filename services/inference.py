@@ -25,7 +25,7 @@ from services.estimation.images.reconstruct import MEANS, Operators, sigma_of_me
 from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, Stack, network, nothing
 from services.runtime.config import Skin
-from services.runtime.stage import Health, Refused, Stage, add_reason, inherited
+from services.runtime.stage import Health, Refused, Stage, inherited, invalidate
 from services.symmetry import SymmetryMean
 
 TELLS = 0.6  # share of held-out touches whose class a registered skin's network must get right for it to be stated
@@ -43,22 +43,20 @@ class Inference(Stage):
         super().__init__(name)
         self.config, self.bundle = skin, bundle
         path = None if skin.network == "none" else bundle.network_path(skin.network) or bundle.network_path("full")
-        self._network = network(str(path)) if path else OneStep(bundle)
+        self._network: Network | OneStep = network(str(path)) if path else OneStep(bundle)
         if isinstance(self._network, Network):
             self._network.check(bundle)
         # Only a network's image is in S/m: a one-step image shows where, not how much, as a registered skin's does.
         self._to_scale = isinstance(self._network, Network) and bundle.locator is None
         self._refuses = self._to_scale and not tells_touches(bundle)  # else the measurements have been explained
         self.linearisation = Linearisation(name, bundle)
-        self._use(bundle)
+        self._build()
         self._tells_shapes = tells_shapes(bundle)
-        self._metres_per_pixel = bundle.metres_per_pixel
         self._locator = None if bundle.locator is None else Locator(bundle.locator)
         self._symmetry: SymmetryMean | None = None
         if isinstance(self._network, Network) and symmetry(skin, bundle) == ON:
             turns = tuple(each.turn for each in symmetries(bundle.skin, bundle.pattern)[1:])
             self._symmetry = SymmetryMean(self._network, turns)
-        self._origin = list(bundle.image_origin)
         self.reset()
 
     def reset(self) -> None:
@@ -66,7 +64,6 @@ class Inference(Stage):
             self._symmetry.forget()
         self._surer: Pictures | None = None  # the mean over the symmetries of the image that is held
         self._last: ImageFrame | None = None  # of the touch that is being held
-        self._last_scan = 0  # of the frame that it was reconstructed from
         self._again = True  # whether a subscriber may not have it: the next held frame brings it
         self._made_of: DeltaFrame | None = None  # frame of the image that is shown
         self._stack_sent = False  # whether who subscribes to stacks has that frame's
@@ -85,11 +82,13 @@ class Inference(Stage):
             self._unseen = frame if frame.averaged else self._unseen
             return []
         out = ImageFrame(**inherited(frame), touched=frame.touched, after=frame.after, estimates=frame.estimates)
-        if frame.calibration != self.linearisation.name and not self._follow(frame.calibration):
-            out.valid = False
-            add_reason(out.reasons, "stale_baseline")
+        followed = self.linearisation.follow(frame.calibration)
+        if followed:
+            self._build()
+        elif followed is None:
+            invalidate(out, "stale_baseline")
             self._counters["uncalibrated"] += 1
-        out.metres_per_pixel, out.origin = self._metres_per_pixel, self._origin
+        out.metres_per_pixel, out.origin = self.bundle.metres_per_pixel, list(self.bundle.image_origin)
         if frame.averaged:
             self._run(frame, out)
         elif frame.held and self._unseen is not None and self._unseen.scan == frame.reconstructed:
@@ -104,24 +103,14 @@ class Inference(Stage):
             self._rest(frame)
         return [out]
 
-    def _follow(self, calibration: str) -> bool:
-        """Use the matrices that frames are made with from now on; False where they cannot be found."""
-        followed = self.linearisation.follow(calibration)
-        if followed:
-            self._build()
-        return followed is not None
-
     def _build(self) -> None:
         """What stands on the matrices in use."""
-        self._use(self.linearisation.bundle)
+        bundle, tare = self.linearisation.bundle, self.config.tare
         if isinstance(self._network, OneStep):
-            self._network = OneStep(self.linearisation.bundle)
-        self._last, self._quiet, self._stated = None, None, 0
-
-    def _use(self, bundle: Bundle) -> None:
+            self._network = OneStep(bundle)
         self.residual = Residual(bundle, self._to_scale)
-        tare = self.config.tare
         self._operators = Operators(bundle.prereconstructor(), tare.scale_per_s, tare.contact_per_s)
+        self._last, self._quiet, self._stated = None, None, 0
 
     def joined(self, topic: str) -> None:
         if topic == "stack":
@@ -179,17 +168,11 @@ class Inference(Stage):
             return True
         if self._quiet is None or self._stated < SETTLED:
             return False
-        return self._prepare_operator(self._quiet) or self.residual.prepare(self._quiet)
-
-    def _prepare_operator(self, quiet: NDArray[np.float32]) -> bool:
-        """Make one of the operators of a touch whose single frames have this noise; False where all are there."""
-        if isinstance(self._network, OneStep):
-            return False
-        for n in MEANS:
-            asked = sigma_of_mean(quiet, n), n, self._tare_frames
-            if not self._operators.has(*asked):
-                return self._operators(*asked) is not None
-        return False
+        for n in () if isinstance(self._network, OneStep) else MEANS:
+            of_mean = sigma_of_mean(self._quiet, n), n, self._tare_frames
+            if not self._operators.has(*of_mean) and self._operators(*of_mean) is not None:
+                return True
+        return self.residual.prepare(self._quiet)
 
     def _pictures(self, frame: DeltaFrame) -> tuple[Stack | None, Pictures]:
         """Of a frame that is to be reconstructed: what the network read, and what it made of it."""
@@ -213,58 +196,40 @@ class Inference(Stage):
         self._counters["networks_run"] += 1
         out.residual = self.residual(frame.difference, frame.sigma, out.image)
         if self._refuses and frame.touched and self.residual.refused:
-            out.valid = False
-            add_reason(out.reasons, "out_of_distribution")
-        self._shows(frame, out)
+            invalidate(out, "out_of_distribution")
+        out.reconstructed = frame.scan
+        self._last, self._unseen, self._surer = out, None, None
+        self._made_of, self._stack_sent, self._again = frame, False, False
         if self._symmetry is not None and frame.touched and stack is not None and np.isfinite(frame.sigma).all():
             self._symmetry.begin(stack, (out.image, out.sigma, out.classes))
 
-    def _shows(self, frame: DeltaFrame, out: ImageFrame) -> None:
-        """`out` has the image of `frame`, which later ones may hold."""
-        self._last, self._unseen, self._surer = out, None, None
-        self._made_of, self._stack_sent = frame, False
-        self._last_scan = out.reconstructed = frame.scan
-        self._again = False
-
     def _hold(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """Hold the image of the frame last reconstructed, if this process has it. It is sent again only for new
-        subscribers.
+        subscribers; a surer one of the same scan takes its place, and is a new one to readers.
         """
-        last = self._last
-        if last is not None and self._last_scan == frame.reconstructed and self._surer is not None and last.image.size:
-            self._shows_surer(last, out)
-        elif last is not None and self._last_scan == frame.reconstructed:
-            out.noise, out.residual = last.noise, last.residual
-            self._shows_again(last, out)
-            self._counters["held"] += 1
-        else:  # skipped, or before we started: not valid until the next reconstruction, at most 16 frames on
+        last, surer = self._last, self._surer
+        if last is None or last.reconstructed != frame.reconstructed:
+            # skipped, or before we started: not valid until the next reconstruction, at most 16 frames on
             out.valid = False
             out.reasons.append("gap")
             self._counters["missed"] += 1
-
-    def _shows_surer(self, last: ImageFrame, out: ImageFrame) -> None:
-        """A better image of the scan that is held takes its place: it is a new one to readers."""
-        assert self._surer is not None
-        out.image, out.sigma, out.classes = self._surer
-        out.noise, out.touches, out.reconstructed = last.noise, last.touches, self._last_scan
-        out.residual = last.residual
-        self._last, self._surer, self._again = out, None, False
-        self._counters["symmetric"] += 1
-
-    def _shows_again(self, last: ImageFrame, out: ImageFrame) -> None:
-        out.held, out.reconstructed = True, self._last_scan
-        if self._again:
-            out.image, out.sigma, out.classes = last.image, last.sigma, last.classes
-            out.touches = last.touches
-            self._again = False
+            return
+        out.noise, out.residual, out.reconstructed = last.noise, last.residual, last.reconstructed
+        out.held = surer is None
+        self._counters["symmetric" if surer else "held"] += 1
+        if surer or self._again:
+            out.image, out.sigma, out.classes = surer or (last.image, last.sigma, last.classes)
+            out.touches, self._again = last.touches, False
+        if surer:
+            self._last, self._surer = out, None
 
     def state(self) -> dict[str, Any]:
         last, rest = self._last, self.linearisation.state()
         if last is None:
             return {"last": None, **rest}
-        kept: dict[str, Any] = {"image": last.image, "sigma": last.sigma, "classes": last.classes, "noise": last.noise}
-        kept |= {"residual": last.residual, "touches": [asdict(t) for t in last.touches]}
-        return {"last": {"scan": self._last_scan, **kept}, **rest}
+        kept = {name: getattr(last, name) for name in ("image", "sigma", "classes", "noise", "residual")}
+        touches = [asdict(touch) for touch in last.touches]
+        return {"last": {"scan": last.reconstructed, **kept, "touches": touches}, **rest}
 
     def load(self, state: dict[str, Any]) -> None:
         self.reset()
@@ -275,17 +240,23 @@ class Inference(Stage):
             return
         try:
             image, sigma, classes = (np.asarray(last[name], np.float32) for name in ("image", "sigma", "classes"))
-            self._last = ImageFrame(skin=self.skin, image=image, sigma=sigma, classes=classes)
-            self._last.noise, self._last_scan = last.get("noise"), int(last["scan"])
-            self._last.touches = [LocatedTouch(**each) for each in last.get("touches", [])]
-            self._last.residual = last.get("residual")
+            self._last = ImageFrame(
+                skin=self.skin,
+                image=image,
+                sigma=sigma,
+                classes=classes,
+                noise=last.get("noise"),
+                residual=last.get("residual"),
+                reconstructed=int(last["scan"]),
+                touches=[LocatedTouch(**each) for each in last.get("touches", [])],
+            )
         except (KeyError, TypeError, ValueError) as wrong:
             raise Refused(f"no image in the saved state ({wrong})") from None
 
     def health(self) -> Health:
-        if isinstance(self._network, OneStep):
-            return Health("OK", [f"bundle {self.bundle.name} has no network: one-step images"], dict(self._counters))
-        return Health("OK", [], dict(self._counters))
+        one_step = isinstance(self._network, OneStep)
+        messages = [f"bundle {self.bundle.name} has no network: one-step images"] if one_step else []
+        return Health("OK", messages, dict(self._counters))
 
 
 def tells_shapes(bundle: Bundle) -> bool:

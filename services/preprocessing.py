@@ -32,7 +32,7 @@ from services.judged import judged
 from services.linearisation import Linearisation
 from services.runtime.config import Skin
 from services.runtime.continuity import Continuity
-from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited
+from services.runtime.stage import SEPARATE, Health, Refused, Stage, add_reason, inherited, invalidate
 
 Array = NDArray[np.float64]
 
@@ -60,8 +60,9 @@ class Preprocessing(Stage):
         self.always_reconstruct = False  # offline: an image of every scan, touched or not
         self.each_alone = False  # offline: frames that do not follow each other
         self.frame_rate, self._news = FrameRate(), BaselineNews()
+        self.revision = 0  # of the baseline
+        self._announced_hash = ""  # of the baseline that info had last
         self._build()
-        self._told_hash = ""  # of the baseline that info told last
         self.reset()
 
     def _build(self) -> None:
@@ -72,31 +73,30 @@ class Preprocessing(Stage):
         self._reconstruction = Reconstruction(Operators(self.pre, tare.scale_per_s, tare.contact_per_s))
 
     def reset(self) -> None:
-        self.estimator = self._new_estimator()
+        self._forget_baseline()
         self.continuity = Continuity()
         self.references = References(len(self.bundle.pattern))
         self._counters = dict.fromkeys(("frames", "touched", "reconstructed", "held", "foreign", "gain_steps"), 0)
         self._foreign = self._problem = self._source = self._board = ""
         self._before: Scan | None = None
-        self._judged: tuple[DeltaFrame, tuple[Judgement, ...]] | None = None  # of the frame processed last
-        self._electrodes = np.zeros(0, np.uint8)
-        self._touched = self._keep = self._silent = False
-        self._told_ns = -LASTS_NS  # `sample` of the last message that said something of touches
+        self._estimate: Estimate | None = None  # the newest
+        self._judged: DeltaFrame | None = None  # frame processed last, where that estimate is its
+        self._touched = self._keep = False
+        self._announced_ns = -LASTS_NS  # `sample` of the last message that had touches, or their end
         self._part = (-1, -1)  # messages last seen, and last handed on
         self._delta = 0  # scan of the last delta frame
         self._sample_ns, self._since_saved = 0, 0
         self._gain_steps = 0  # of this baseline, that were counted
         self._undated_s = 0.0  # age of a baseline that an earlier process took, until the first scan
+
+    def _forget_baseline(self) -> None:
+        self.estimator = Estimator(skin_tables(self.bundle), self.config.tare.frames)
         self._trusted: Baseline | None = None  # too old to be used: the first scans are held against it
         self._use(None)
 
-    def _new_estimator(self) -> Estimator:
-        return Estimator(skin_tables(self.bundle), self.config.tare.frames)
-
     def _use(self, baseline: Baseline | None) -> None:
-        self.baseline = baseline
-        self.revision = getattr(self, "revision", 0) + 1
-        self._of = self.estimator.skin
+        self.baseline, self._tared = baseline, self.estimator.skin
+        self.revision += 1
         if baseline is not None:
             self._reconstruction.begin(self._sigma(baseline), baseline.frames)
 
@@ -136,43 +136,37 @@ class Preprocessing(Stage):
         estimate = self.estimator.step(scan)
         self._look_at_baseline()
         self._count_gain_steps()
-        self._electrodes = estimate.electrodes
-        self._silent = any(each.name == "silent" and each.ratio >= 1 for each in estimate.judgements)
         out.valid = estimate.valid
         for reason in estimate.reasons:
             add_reason(out.reasons, reason)
+        self._estimate, self._judged = estimate, out
         if frame.parts > 1 and not estimate.whole:
-            made = self._part_of(out, estimate)
-        else:
-            self._part = (frame.scan, frame.scan)
-            made = [self._delta_of(out, estimate)]
-        self._judged = out, estimate.judgements
-        return made
+            return self._part_of(out, estimate)
+        self._part = (frame.scan, frame.scan)
+        return [self._delta_of(out, estimate)]
 
     @property
     def judgements(self) -> tuple[Judgement, ...]:
         """Of the frame processed last."""
-        return () if self._judged is None else self._judged[1]
+        return () if self._judged is None or self._estimate is None else self._estimate.judgements
 
     def beside(self, wanted: frozenset[str]) -> list[Frame]:
         self.estimator.learn()
-        return [judged(*self._judged)] if self._judged is not None and "judgements" in wanted else []
+        return [judged(self._judged, self.judgements)] if self._judged is not None and "judgements" in wanted else []
 
     def _part_of(self, out: DeltaFrame, estimate: Estimate) -> list[Frame]:
         """Of parts in which nothing touches none travels on."""
-        if not self._tells(out, estimate):
+        if not self._announces(out, estimate):
             return []
         self._part = (out.scan, out.scan)
-        return [PartFrame(**inherited(out), after=self._delta, estimates=self._said(estimate))]
+        return [PartFrame(**inherited(out), after=self._delta, estimates=self._touches(estimate))]
 
-    def _tells(self, out: DeltaFrame, estimate: Estimate) -> bool:
-        """Whether something is to be said of touches; an end for as long as readers are to see it."""
+    def _announces(self, out: DeltaFrame, estimate: Estimate) -> bool:
+        """Whether there is something of touches to send; an end for as long as readers are to see it."""
         now_ns = out.stamps.get("sample", 0)
-        if estimate.touches:
-            self._told_ns = now_ns
-        elif not estimate.valid and now_ns - self._told_ns < LASTS_NS:
-            self._told_ns = now_ns
-        return 0 <= now_ns - self._told_ns < LASTS_NS
+        if estimate.touches or (not estimate.valid and now_ns - self._announced_ns < LASTS_NS):
+            self._announced_ns = now_ns
+        return 0 <= now_ns - self._announced_ns < LASTS_NS
 
     def _delta_of(self, out: DeltaFrame, estimate: Estimate) -> DeltaFrame:
         baseline, touch = self.baseline, estimate.touch
@@ -180,9 +174,9 @@ class Preprocessing(Stage):
         out.electrodes = estimate.electrodes
         if baseline is None or touch is None:
             return self._blank(out)
-        out.estimates = self._said(estimate)
+        out.estimates = self._touches(estimate)
         out.touched = self._touched = estimate.touched or bool(out.estimates)
-        self._tells(out, estimate)
+        self._announces(out, estimate)
         out.score, out.threshold = touch.statistic, touch.expected
         self._counters["touched"] += out.touched
         if not estimate.scan.believed:
@@ -195,7 +189,8 @@ class Preprocessing(Stage):
         out.tare_frames = self._reconstruction.frames
         if not out.touched:
             self._reconstruction.reset()
-            self._worth_keeping()
+            self._since_saved = (self._since_saved + 1) % SAVE_EVERY
+            self._keep |= not self._since_saved
         if out.touched or self.always_reconstruct or not self.config.touch.skip_untouched:
             self._reconstruct(out, d)
         return out
@@ -219,12 +214,11 @@ class Preprocessing(Stage):
         self._foreign = f"frames of {found} measurements, the bundle {self.bundle.name} has {expected}"
         return self._unusable(out, "out_of_distribution")
 
-    def _said(self, estimate: Estimate) -> list[EstimatedTouch]:
+    def _touches(self, estimate: Estimate) -> list[EstimatedTouch]:
         return [on_the_wire(touch, self.bundle.metres_per_unit) for touch in estimate.touches]
 
     def _unusable(self, out: DeltaFrame, reason: str) -> DeltaFrame:
-        out.valid = False
-        add_reason(out.reasons, reason)
+        invalidate(out, reason)
         return self._blank(out)
 
     def _blank(self, out: DeltaFrame) -> DeltaFrame:
@@ -257,10 +251,6 @@ class Preprocessing(Stage):
             return False
         return True
 
-    def _forget_baseline(self) -> None:
-        self.estimator, self._trusted = self._new_estimator(), None
-        self._use(None)
-
     # --- the baseline ---
 
     def _follow(self, frame: RawFrame) -> None:
@@ -271,9 +261,8 @@ class Preprocessing(Stage):
         if self._source and (self._source == "replay") != replayed:
             self.reset()
         elif self.baseline is not None and not replayed and self.baseline.board != frame.board:
-            problem = f"the baseline was of board {self.baseline.board}, this is {frame.board}: taking a new one"
+            self._problem = f"the baseline was of board {self.baseline.board}, this is {frame.board}: taking a new one"
             self._forget_baseline()
-            self._problem = problem
         self._source, self._board = frame.source, frame.board
         if as_sent(frame)[0]:
             self._sample_ns = frame.stamps.get("sample", 0)
@@ -284,7 +273,7 @@ class Preprocessing(Stage):
 
     def _look_at_baseline(self) -> None:
         """Whether the estimator has taken another one."""
-        if self.estimator.skin is not self._of:
+        if self.estimator.skin is not self._tared:
             known = self._trusted if self.estimator.now.adopted_age_s is not None else None
             self._undated_s = 0.0 if known is None else self._undated_s
             self._use(self._taken("start") if known is None else replace(known, restored=True))
@@ -293,14 +282,10 @@ class Preprocessing(Stage):
         if problem or self.estimator.skin is not None:
             self._problem = problem
 
-    @property
-    def _steps_of_baseline(self) -> int:
-        skin = self.estimator.skin
-        return 0 if skin is None else skin.faults.now.gain_steps
-
     def _count_gain_steps(self) -> None:
-        self._counters["gain_steps"] += max(0, self._steps_of_baseline - self._gain_steps)
-        self._gain_steps = self._steps_of_baseline
+        before, skin = self._gain_steps, self.estimator.skin
+        self._gain_steps = 0 if skin is None else skin.faults.now.gain_steps
+        self._counters["gain_steps"] += max(0, self._gain_steps - before)
 
     def _taken(self, by: str) -> Baseline:
         skin = self.estimator.skin
@@ -334,8 +319,7 @@ class Preprocessing(Stage):
         self._trusted, self._undated_s = None, 0.0
         self._use(self._taken("command"))
         assert self.baseline is not None
-        self._keep = True
-        self._touched = False
+        self._keep, self._touched = True, False
         relative = float(np.median(self.baseline.sigma / np.maximum(self.baseline.z0, 1e-12)))
         wanted = self.config.tare.calibrate and args.get("calibrate", True)
         calibrating = wanted and self.linearisation.tared(self.baseline)
@@ -370,11 +354,6 @@ class Preprocessing(Stage):
         self._news, self._keep = BaselineNews(), True
 
     # --- kept state ---
-
-    def _worth_keeping(self) -> None:
-        self._since_saved += 1
-        if self._since_saved >= SAVE_EVERY:
-            self._since_saved, self._keep = 0, True
 
     def saved(self) -> dict[str, Any] | None:
         if not self._keep or self._source == "replay" or (baseline := self._by_now()) is None:
@@ -414,7 +393,7 @@ class Preprocessing(Stage):
         baseline = self.baseline
         return {
             "touched": self._touched,
-            "told_ns": self._told_ns,
+            "told_ns": self._announced_ns,
             "continuity": self.continuity.state(),
             "hold": self._reconstruction.state(),
             "estimator": self.estimator.state(),
@@ -455,7 +434,8 @@ class Preprocessing(Stage):
                 self.set_baseline(baseline)
             return
         self.estimator.load(state["estimator"])
-        self._gain_steps = self._steps_of_baseline  # whoever saved them has counted them
+        skin = self.estimator.skin
+        self._gain_steps = 0 if skin is None else skin.faults.now.gain_steps  # whoever saved them has counted them
         trusted = state.get("trusted")
         self._trusted = None if trusted is None else Baseline.from_dict(trusted, k)
         self._undated_s = float(state.get("undated_s", 0.0))
@@ -464,7 +444,7 @@ class Preprocessing(Stage):
         self._before = self.estimator.now.before
         self._reconstruction.load(state["hold"])
         self.continuity.load(state["continuity"])
-        self._touched, self._told_ns = bool(state["touched"]), int(state["told_ns"])
+        self._touched, self._announced_ns = bool(state["touched"]), int(state["told_ns"])
         seen, handed = map(int, state["parts"])
         self._part = (seen, handed)  # but who reads parts from now on may never see the delta frame before
         self._board = str(state["board"])  # whether frames are a recording's, the next one says
@@ -472,8 +452,7 @@ class Preprocessing(Stage):
     # --- beside frames ---
 
     def warm_up(self) -> None:
-        if self.baseline is not None:
-            self._reconstruction.prepare()
+        self.prepare()
 
     def prepare(self) -> bool:
         return self.baseline is not None and self._reconstruction.prepare()
@@ -482,25 +461,25 @@ class Preprocessing(Stage):
         baseline, rate_hz = self._by_now(), self.frame_rate.found
         if not self._news(baseline, self._sample_ns, rate_hz):
             return None
-        if baseline is not None and baseline.hash != self._told_hash:
-            self.revision, self._told_hash = self.revision + 1, baseline.hash
-        said = describe(self.config, self.bundle, self._force, baseline, self.revision, rate_hz)
-        said["symmetry"] = self._symmetry
-        return said | {"mounting": self.linearisation.found} if self.linearisation.found else said
+        if baseline is not None and baseline.hash != self._announced_hash:
+            self.revision, self._announced_hash = self.revision + 1, baseline.hash
+        info = describe(self.config, self.bundle, self._force, baseline, self.revision, rate_hz)
+        info["symmetry"] = self._symmetry
+        return info | {"mounting": self.linearisation.found} if self.linearisation.found else info
 
     def health(self) -> Health:
         problem = self._foreign or self._problem
         if not problem and self.baseline is None:
-            taring = self.estimator.taring
-            problem = f"{TAKING}: {len(taring.latest)} of {taring.latest.needed} frames"
-        problems = [*([problem] if problem else []), *self._advice()]
-        problems += [self.linearisation.problem] if self.linearisation.problem else []
+            latest = self.estimator.taring.latest
+            problem = f"{TAKING}: {len(latest)} of {latest.needed} frames"
+        electrodes, judgements = np.zeros(0, np.uint8), tuple[Judgement, ...]()
+        if self._estimate is not None:
+            electrodes, judgements = self._estimate.electrodes, self._estimate.judgements
+        silent = any(each.name == "silent" and each.ratio >= 1 for each in judgements)
+        advice = sentences(electrodes, self.estimator.wire, silent)
+        problems = [*filter(None, (problem, *advice, self.linearisation.problem))]
         unchecked = [self._unchecked] if self._unchecked else []  # as the bundle is made: no warning
         return Health("WARN" if problems else "OK", [*problems, *unchecked], dict(self._counters))
-
-    def _advice(self) -> list[str]:
-        """What a person can do about electrodes."""
-        return sentences(self._electrodes, self.estimator.wire, self._silent)
 
 
 def on_the_wire(touch: TouchEstimate, metres: float) -> EstimatedTouch:

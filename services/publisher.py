@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from models.bundle import Bundle
+from models.locator_arrays import QUANTITIES
 from models.measurement.responses.tables import tells_touches
 from protocol.frames import (
     SHAPES,
@@ -30,14 +31,13 @@ from protocol.held import HeldImage
 from services.contacts.contact_writer import ContactWriter
 from services.contacts.force.law import ForceLaw
 from services.contacts.images.of_image import ImageTouches
-from services.contacts.images.registered import measures_force
 from services.contacts.invalid_spell import InvalidSpell
 from services.contacts.lasting import LastingStates
 from services.contacts.placing import placement
 from services.contacts.reading import Appearance, Appearances
 from services.describe import geometry
 from services.runtime.config import Skin
-from services.runtime.stage import HARMLESS, SEPARATE, Health, Stage, add_reason, inherited
+from services.runtime.stage import HARMLESS, SEPARATE, Health, Stage, add_reason, inherited, invalidate
 
 COARSE = 0.05  # of the sheet's side: a place that is less sure than that is coarse
 SAME_BIRTH_NS = 50_000_000  # a touch is the same where it has the same number and was born at the same time
@@ -63,7 +63,8 @@ class Publishing(Stage):
         super().__init__(name)
         self.config = skin
         self.law = law or ForceLaw.of(skin, bundle, name)
-        by_registration = measures_force(bundle)
+        # a registered skin may measure forces by itself: where it was pressed with known ones
+        by_registration = bundle.locator is not None and QUANTITIES[int(bundle.locator.quantity)] == "force_n"
         self._tells_force = self.law.exists or by_registration
         self._calibrated = self.law.calibrated or (by_registration and not self.law.exists)
         self._image_touches = None if tells_touches(bundle) else ImageTouches(bundle)
@@ -89,8 +90,7 @@ class Publishing(Stage):
 
     def new_session(self) -> None:
         self._next_id, self._ids = 1, {}
-        self._shown, self._untold = [], []
-        self._forget()
+        self.wake()
 
     def wake(self) -> None:
         """Nobody is left who was told of what touched."""
@@ -122,23 +122,22 @@ class Publishing(Stage):
         out = ContactFrame(**inherited(frame), frame_id=self.frame_id, force_calibrated=self._calibrated)
         if not self._tells_force:
             add_reason(out.reasons, "uncalibrated_force")
-        whole = isinstance(frame, ImageFrame)
+        now_ns = frame.stamps.get("sample", 0)
         if not all(_readable(touch, self._reach_m) for touch in frame.estimates):
-            out.valid = False
-            add_reason(out.reasons, "non_finite")
+            invalidate(out, "non_finite")
         elif isinstance(frame, ImageFrame):
             self._look(frame, out)
-        self._watch(frame.stamps.get("sample", 0))
+        self._watch(now_ns)
         if out.valid or not SAYS_NOTHING & set(out.reasons):
             out.contacts = self._contacts(frame, out)
             self._note(out)
         else:
             self._watched = False
             self._counters["unknown"] += 1
-        self._invalid(out.valid, [r for r in out.reasons if r not in HARMLESS], frame.stamps.get("sample", 0))
+        self._invalid(out.valid, [r for r in out.reasons if r not in HARMLESS], now_ns)
         if frame.part and out.valid:
-            out.contacts = self.lasting(out.contacts, frame.stamps.get("sample", 0))
-        self._last = out, whole
+            out.contacts = self.lasting(out.contacts, now_ns)
+        self._last = out, isinstance(frame, ImageFrame)
         return [out]
 
     def beside(self, wanted: frozenset[str]) -> list[Frame]:
@@ -161,11 +160,9 @@ class Publishing(Stage):
         out.held = frame.held
         self.lacks = not self.held.complete(frame)
         if self.lacks and self._image_touches is not None:
-            out.valid = False
-            add_reason(out.reasons, "gap")
+            invalidate(out, "gap")
         if frame.image.size and not np.isfinite(frame.image).all():
-            out.valid = False
-            add_reason(out.reasons, "non_finite")
+            invalidate(out, "non_finite")
             return
         if frame.touched and frame.residual is not None:
             out.quality = max(0.0, 1.0 - frame.residual)
@@ -186,8 +183,7 @@ class Publishing(Stage):
         pictured = self._image_touches is not None and isinstance(frame, ImageFrame) and frame.touched
         found = self._found(frame, before, alone)
         if pictured and out.valid and not found:
-            out.valid = False
-            add_reason(out.reasons, "out_of_distribution")
+            invalidate(out, "out_of_distribution")
         here = {contact.id for contact in found}
         gone = [c for c in (*self._untold, *before.values()) if c.id not in here]
         self._watched = out.valid
@@ -214,8 +210,7 @@ class Publishing(Stage):
             return self._measured(frame, before, alone)
         if isinstance(frame, ImageFrame) and not frame.touched:
             return []
-        image = (frame.session, frame.reconstructed) if isinstance(frame, ImageFrame) else self._image_of
-        if isinstance(frame, PartFrame) or image == self._image_of:
+        if isinstance(frame, PartFrame) or (frame.session, frame.reconstructed) == self._image_of:
             return self._moved(frame, before)
         known_looks = {number: self._looks[number] for number in before}  # they stay where this frame is not valid
         touches = self._image_touches.found(frame, known_looks)
@@ -227,8 +222,7 @@ class Publishing(Stage):
             self._next_id = max(self._next_id, number + 1)
             state = "hold" if known or not (self._watched or alone) else "begin"
             self._looks[number], self._drops[number] = touch.looks, touch.segment.peak
-            moves = self._image_touches.estimated(touch.looks, frame.estimates)
-            if moves is not None:
+            if (moves := self._image_touches.estimated(touch.looks, frame.estimates)) is not None:
                 self._anchors[number] = moves
             found.append(self._writer.of_image(number, state, touch, frame, moves))
         return found
@@ -277,22 +271,16 @@ class Publishing(Stage):
             add_reason(out.reasons, "coarse")
         for contact in out.contacts:
             if contact.id in self._drops and self.law.impossible(self._drops[contact.id], contact.force_n):
-                out.valid = False
-                add_reason(out.reasons, "out_of_distribution")
+                invalidate(out, "out_of_distribution")
 
     def _force(self, frame: ContactFrame) -> ForceFrame:
         """The total force; valid if the contacts are."""
         present = [c for c in frame.contacts if c.state != "end"]
         total = None if not self._tells_force else sum(c.force_n or 0.0 for c in present)
         wrench = np.sum([c.wrench for c in present], axis=0).tolist() if present else [0.0] * 6
-        sigmas = [c.force_sigma_n for c in present]
-        known = [sigma for sigma in sigmas if sigma is not None]
-        return ForceFrame(
-            **inherited(frame),
-            wrench=wrench,
-            force_n=total,
-            force_sigma_n=math.hypot(*known) if known and len(known) == len(sigmas) else None,
-        )
+        sigmas = [c.force_sigma_n for c in present if c.force_sigma_n is not None]
+        sigma = math.hypot(*sigmas) if sigmas and len(sigmas) == len(present) else None
+        return ForceFrame(**inherited(frame), wrench=wrench, force_n=total, force_sigma_n=sigma)
 
     def _shape(self, out: ContactFrame) -> ShapeFrame:
         present = [c for c in out.contacts if c.state != "end"]

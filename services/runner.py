@@ -26,7 +26,7 @@ from services.runtime.channel import Channel, Feed
 from services.runtime.commands import Commands
 from services.runtime.config import ConfigFile
 from services.runtime.lateness import Lateness
-from services.runtime.stage import Refused, Stage, add_reason
+from services.runtime.stage import Refused, Stage, invalidate
 from services.runtime.waiting import Waiter, wake_on_signals
 
 HEARTBEAT_S = 1.0
@@ -168,8 +168,7 @@ class Runner:
                 out.stamps.setdefault(channel.stage.stamp, done)
             late = self._lateness.late(out) if late is None else late
             if late:
-                out.valid = False
-                add_reason(out.reasons, "late")
+                invalidate(out, "late")
             self._send(channel, out)
         return late
 

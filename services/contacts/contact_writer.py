@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from protocol.frames import SHAPES, Contact, EstimatedTouch, ImageFrame
 from services.contacts.force.law import Force, ForceLaw, Look
 from services.contacts.images.of_image import ImageTouch
-from services.contacts.images.registered import registered
 from services.contacts.images.segmentation import Segment
 from services.contacts.reading import Appearance
-from services.contacts.surface import Placed, Placement
+from services.contacts.surface import Placement
 
 
 class ContactWriter:
@@ -26,11 +26,9 @@ class ContactWriter:
     def of_estimate(self, number: int, state: str, touch: EstimatedTouch, look: Appearance) -> Contact:
         """A touch as the measurements tell it, and as it looks."""
         contact = self._here(number, state, look, self.law.of_touch(touch, look.classes), touch.velocity)
-        return replace(
-            contact,
-            confidence=0.5 * (1 + math.erf(math.sqrt(touch.z2 / 2))),
-            position_sigma=list(touch.sigma),
-        )
+        contact.confidence = 0.5 * (1 + math.erf(math.sqrt(touch.z2 / 2)))
+        contact.position_sigma = list(touch.sigma)
+        return contact
 
     def of_image(
         self, number: int, state: str, touch: ImageTouch, frame: ImageFrame, moves: EstimatedTouch | None
@@ -41,67 +39,58 @@ class ContactWriter:
         if located is not None and not self.law.exists:
             found = Force(located.force_n, None if located.force_n is None else located.value_sigma)
         contact = self._here(number, state, looks, found, (0.0, 0.0) if moves is None else moves.velocity)
-        return replace(
-            contact, confidence=confidence(touch.segment), **({} if located is None else registered(located))
-        )
+        contact.confidence = confidence(touch.segment)
+        if located is not None:
+            contact.position_sigma, contact.indentation_m = list(located.sigma), located.indentation_m
+            contact.indentation_sigma_m = None if located.indentation_m is None else located.value_sigma
+        return contact
 
     def _here(self, number: int, state: str, looks: Appearance, force: Force, velocity: Sequence[float]) -> Contact:
         """What all contacts that are there have."""
         best = int(np.argmax(looks.classes)) if looks.classes else -1
-        at, (vx, vy) = self.place(looks.x, looks.y), velocity
         return Contact(
             id=number,
             state=state,
-            position=at.point.tolist(),
-            velocity=(vx * at.along_x + vy * at.along_y).tolist(),
-            normal=at.normal.tolist(),
             orientation=looks.orientation,
             area_m2=looks.area_m2,
             force_n=force.newton,
             force_sigma_n=force.sigma,
             pressure_pa=force.pressure,
             pressure_sigma_pa=force.pressure_sigma,
-            wrench=_wrench(at, force.newton or 0.0),
             shape=SHAPES[best] if looks.classes else "unknown",
             shape_probability=looks.classes[best] if looks.classes else None,
-            sheet=None if self.place.flat else [looks.x, looks.y],
+            **self._placed(looks.x, looks.y, velocity, force.newton or 0.0),
         )
 
     def moved(self, contact: Contact, before: EstimatedTouch, now: EstimatedTouch) -> Contact:
         """The same contact, as far on as the measurements say."""
-        (x0, y0), (x, y), (vx, vy) = before.position, now.position, now.velocity
+        (x0, y0), (x, y) = before.position, now.position
         on_x, on_y = contact.on_sheet[0] + x - x0, contact.on_sheet[1] + y - y0
-        at = self.place(on_x, on_y)
-        return replace(
-            contact,
-            position=at.point.tolist(),
-            velocity=(vx * at.along_x + vy * at.along_y).tolist(),
-            normal=at.normal.tolist(),
-            wrench=_wrench(at, contact.force_n or 0.0),
-            sheet=None if self.place.flat else [on_x, on_y],
-        )
+        return replace(contact, **self._placed(on_x, on_y, now.velocity, contact.force_n or 0.0))
+
+    def _placed(self, x: float, y: float, velocity: Sequence[float], force: float) -> dict[str, Any]:
+        """The fields that a place on the sheet decides. The touch presses against the normal: its wrench is about the
+        origin of the frame of contacts.
+        """
+        at, (vx, vy) = self.place(x, y), velocity
+        pressed = -force * at.normal
+        return {
+            "position": at.point.tolist(),
+            "velocity": (vx * at.along_x + vy * at.along_y).tolist(),
+            "normal": at.normal.tolist(),
+            "wrench": [*pressed.tolist(), *np.cross(at.point, pressed).tolist()],
+            "sheet": None if self.place.flat else [x, y],
+        }
 
     def gone(self, contacts: Sequence[Contact]) -> list[Contact]:
         """The last contacts of touches that were shown so."""
         force = 0.0 if self.tells_force else None
         return [
             Contact(
-                id=c.id,
-                state="end",
-                position=c.position,
-                normal=c.normal,
-                force_n=force,
-                confidence=0.0,
-                sheet=c.sheet,
+                id=c.id, state="end", position=c.position, normal=c.normal, force_n=force, confidence=0.0, sheet=c.sheet
             )
             for c in contacts
         ]
-
-
-def _wrench(at: Placed, force: float) -> list[float]:
-    """On the skin, at its frame's origin: the touch presses against the normal."""
-    pressed = -force * at.normal
-    return [*pressed.tolist(), *np.cross(at.point, pressed).tolist()]
 
 
 def confidence(s: Segment) -> float:

@@ -160,3 +160,9 @@ def inherited(frame: Frame) -> dict[str, Any]:
 def add_reason(reasons: list[str], reason: str) -> None:
     if reason not in reasons:
         reasons.append(reason)
+
+
+def invalidate(frame: Frame, reason: str) -> None:
+    """A frame that is not to be acted on, and why."""
+    frame.valid = False
+    add_reason(frame.reasons, reason)
