@@ -46,11 +46,7 @@ class MountedSkin:
         """Raises CalibrationFileError."""
         self.packed = packed
         self.bundle = unpack(packed, bundle)
-        self._tables: SkinTables | None = None
-
-    def make_ready(self) -> None:
-        """Make what its stages would otherwise make at their first frame, and hold it for them."""
-        self._tables = skin_tables(self.bundle)
+        self.tables: SkinTables | None = None  # held, so that stages need not make them at their first frame
 
 
 def needs_fit(baseline: Baseline, bundle: Bundle) -> bool:
@@ -83,14 +79,13 @@ class MountingFit:
         """bundle: as it was loaded, not calibrated. keep_as: the skin under whose name what is found is kept."""
         self.bundle, self._keep_as = bundle, keep_as
         self.problem = ""  # why the last fit gave nothing, for a person
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._reader: Thread | None = None
-        self._read: MountedSkin | None = None
+        self._reader: Thread | None = None  # of what the process found
+        self._found: MountedSkin | None = None
 
     @property
     def busy(self) -> bool:
-        return self._process is not None or self._reader is not None
+        return self._reader is not None
 
     def start(self, baseline: Baseline) -> None:
         """Begin with the mean of an untouched skin's frames; a fit that is under way is dropped."""
@@ -99,82 +94,72 @@ class MountingFit:
         if self.problem:
             return
         try:
-            self._begin(baseline)
+            folder = tempfile.TemporaryDirectory(prefix="eitskin-fit-", ignore_cleanup_errors=True)
+            self._process = self._program(Path(folder.name), baseline)
         except OSError as why:  # no room, no process: the bundle is used as it is
-            self._clear()
             self.problem = f"the skin could not be calibrated: {in_words(why)}"
+            return
+        self._reader = Thread(target=self._read, args=(self._process, folder), name="mounting", daemon=True)
+        self._reader.start()
 
-    def _begin(self, baseline: Baseline) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="eitskin-fit-")
-        request, out = (str(Path(self._folder.name, name)) for name in ("request.npz", "out"))
+    def _program(self, folder: Path, baseline: Baseline) -> subprocess.Popen[bytes]:
+        request, out = folder / "request.npz", folder / "out"
         sigma = baseline.sigma / np.sqrt(max(baseline.frames, 1))
         np.savez(request, z0=baseline.z0, sigma=sigma, baseline_hash=np.str_(baseline.hash))
-        bundle = str(self.bundle.path.resolve())
-        words = [sys.executable, "-m", "models.fit_calibration", bundle, request, out]
-        with Path(self._folder.name, "said").open("wb") as said:
-            self._process = subprocess.Popen(words, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
+        words = [
+            sys.executable,
+            "-m",
+            "models.fit_calibration",
+            str(self.bundle.path.resolve()),
+            str(request),
+            str(out),
+        ]
+        with (folder / "output").open("wb") as output:
+            return subprocess.Popen(words, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
 
     def wait(self) -> MountedSkin | None:
         """The same for who has the time: what was found, or None and `problem`."""
-        if self._process is not None:
-            try:
-                self._process.wait(LONGEST_S)
-            except subprocess.TimeoutExpired:
+        if self._reader is not None:
+            self._reader.join(LONGEST_S)
+            if self._reader.is_alive():
                 self.stop()
                 self.problem = f"the skin could not be calibrated: the fit took more than {LONGEST_S:.0f} s"
-                return None
-            self.poll()
-        if self._reader is not None:
-            self._reader.join()
         return self.poll()
 
     def poll(self) -> MountedSkin | None:
         """What was found, once, when it is ready to be used."""
-        if self._process is not None and self._process.poll() is not None:
-            code, self._process = self._process.returncode, None
-            self._reader = Thread(target=self._finish, args=(code,), name="mounting", daemon=True)
-            self._reader.start()
         if self._reader is None or self._reader.is_alive():
             return None
-        self._reader, found, self._read = None, self._read, None
-        self._clear()
+        self._process, self._reader = None, None
+        found, self._found = self._found, None
         return found
 
     def stop(self) -> None:
-        self.problem = ""  # of an earlier tare
-        if self._process is not None:
+        if self._process is not None and self._reader is not None:
             self._process.kill()
-            self._process.wait()
-            self._process = None
-        if self._reader is not None:
             self._reader.join()
-            self._reader = None
-        self._read = None
-        self._clear()
+        self._process, self._reader, self._found = None, None, None
+        self.problem = ""  # of an earlier tare
 
-    def _finish(self, code: int) -> None:
+    def _read(self, process: subprocess.Popen[bytes], made: tempfile.TemporaryDirectory[str]) -> None:
         """In a thread: what takes a frame's time and more, so that adopting it takes none."""
-        assert self._folder is not None
-        folder = Path(self._folder.name)
+        folder = Path(made.name)
         try:
-            if code:
-                said = (folder / "said").read_text(errors="replace").strip().splitlines()
-                raise CalibrationFileError(said[-1] if said else f"the fit ended with exit code {code}")
+            if code := process.wait():
+                lines = (folder / "output").read_text(errors="replace").strip().splitlines()
+                raise CalibrationFileError(lines[-1] if lines else f"the fit ended with exit code {code}")
             found = MountedSkin(read_bytes(folder / "out", MOST_BYTES), self.bundle)
             if self._keep_as:
                 keep(self._keep_as, found)
                 read = kept(self._keep_as, self.bundle)
                 if read is None or read.bundle.hash != found.bundle.hash:  # inference could not follow
                     raise CalibrationFileError("what was found could not be kept in the runtime folder: is it full?")
-            found.make_ready()
-            self._read = found
+            found.tables = skin_tables(found.bundle)
+            self._found = found
         except (CalibrationFileError, FileError, OSError) as why:
             self.problem = f"the skin could not be calibrated: {in_words(why)}"
-
-    def _clear(self) -> None:
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
+        finally:
+            made.cleanup()
 
 
 def keep(skin: str, found: MountedSkin | None) -> None:

@@ -33,8 +33,8 @@ from services.contacts.force.law import ForceLaw
 from services.contacts.images.of_image import ImageTouches
 from services.contacts.invalid_spell import InvalidSpell
 from services.contacts.lasting import LastingStates
-from services.contacts.placing import placement
 from services.contacts.reading import Appearance, Appearances
+from services.contacts.surface import placement
 from services.describe import geometry
 from services.runtime.config import Skin
 from services.runtime.stage import HARMLESS, SEPARATE, Health, Stage, add_reason, inherited, invalidate

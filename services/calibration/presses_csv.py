@@ -27,7 +27,7 @@ from protocol.whole_file import whole_file
 from services.calibration.force_fit import CalibrationError, Press
 from services.calibration.seen import SeenTouch
 from services.contacts.force.calibration_file import Of
-from services.contacts.force.law import Quantity
+from services.contacts.force.curve import Quantity
 
 QUANTITIES: dict[Of, str] = {"pressure": "pressure_n", "peak": "peak_s_per_m", "integral": "integral_s_m"}
 SEEN = ("x_m", "y_m", *QUANTITIES.values())

@@ -11,8 +11,8 @@ import numpy as np
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, ImageFrame
 from services.contacts.force.calibration_file import Of
-from services.contacts.force.curve import Curve
-from services.contacts.force.law import ForceLaw, Quantity
+from services.contacts.force.curve import Curve, Quantity
+from services.contacts.force.law import ForceLaw
 from services.publisher import Publishing
 from services.runtime.config import Skin
 
@@ -60,7 +60,11 @@ class TouchReader:
             publishing.each_alone = each_alone
 
     def __call__(self, frame: ImageFrame) -> SeenTouches:
-        made = {of: self._contacts(publishing, frame) for of, publishing in self._by_kind.items()}
+        made = dict[Of, ContactFrame]()
+        for of, publishing in self._by_kind.items():
+            (contacts,) = publishing.process(frame, frozenset())
+            assert isinstance(contacts, ContactFrame)
+            made[of] = contacts
         first = made["pressure"]
         if not first.valid:
             return SeenTouches([], list(first.reasons) or ["not valid"])
@@ -70,12 +74,6 @@ class TouchReader:
             same = {of: next(c for c in each.contacts if c.id == contact.id) for of, each in made.items()}
             found.append(SeenTouch(x, y, {of: _quantity(c.force_n, c.force_sigma_n) for of, c in same.items()}))
         return SeenTouches(sorted(found, key=lambda touch: -touch.acts), [])
-
-    @staticmethod
-    def _contacts(publishing: Publishing, frame: ImageFrame) -> ContactFrame:
-        (made,) = publishing.process(frame, frozenset())
-        assert isinstance(made, ContactFrame)
-        return made
 
 
 def _quantity(value: float | None, sigma: float | None) -> Quantity:

@@ -25,7 +25,7 @@ from services.cli import doctor_live as live
 from services.cli.doctor_live import Finding
 from services.cli.doctor_mounting import mounting_found
 from services.contacts.force.law import ForceLaw, known_radius
-from services.contacts.placing import placement
+from services.contacts.surface import placement
 from services.describe import ON, geometry, symmetry
 from services.estimation.faults import checks
 from services.estimation.initialisation.baseline import implausibility

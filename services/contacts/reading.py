@@ -5,7 +5,6 @@ image shows a touch yet, the disc that the measurements tell.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +41,11 @@ class Pixels:
         """Column and row of a place [m]; whole numbers are middles of pixels."""
         x0, y0 = self.origin
         return (x - x0) / self.side_m - 0.5, (y - y0) / self.side_m - 0.5
+
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        """The other way round: of a column and a row [m]."""
+        x0, y0 = self.origin
+        return x0 + (x + 0.5) * self.side_m, y0 + (y + 0.5) * self.side_m
 
     def area(self, s: Segment) -> float:
         """m^2"""
@@ -80,15 +84,9 @@ class Appearances:
         x, y = touch.position
         known = self.known.get(touch.id)
         if known is None:
-            return Appearance(x, y, math.pi * touch.radius_m**2, 0.0, _round(x, y, touch.radius_m), [])
+            angle, radius = 2 * np.pi * np.arange(CORNERS) / CORNERS, touch.radius_m
+            disc = np.column_stack([x + radius * np.cos(angle), y + radius * np.sin(angle)])
+            return Appearance(x, y, math.pi * radius**2, 0.0, disc.tolist(), [])
         dx, dy = x - known.x, y - known.y
         moved = [[px + dx, py + dy] for px, py in known.outline]
         return Appearance(x, y, known.area_m2, known.orientation, moved, known.classes)
-
-
-def _round(x: float, y: float, radius: float) -> list[list[float]]:
-    angle = 2 * np.pi * np.arange(CORNERS) / CORNERS
-    corners: Sequence[Sequence[float]] = np.column_stack(
-        [x + radius * np.cos(angle), y + radius * np.sin(angle)]
-    ).tolist()
-    return [list(corner) for corner in corners]

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from services.runtime.config import ConfigError, Skin
+
 Array = NDArray[np.float64]
 
 
@@ -25,10 +27,6 @@ class Placed:
     normal: Array
     along_x: Array
     along_y: Array
-
-    def turned(self, turn: Array, offset: Array) -> Placed:
-        """In another frame: p' = turn p + offset."""
-        return Placed(turn @ self.point + offset, turn @ self.normal, turn @ self.along_x, turn @ self.along_y)
 
 
 class Plane:
@@ -79,19 +77,37 @@ def rotation(quaternion_xyzw: Sequence[float]) -> Array:
 
 
 class Placement:
-    """From a place on the sheet to what a contact says of it; `flat`: they are the same numbers."""
+    """From a place on the sheet to where it is; `flat`: they are the same numbers.
 
-    def __init__(
-        self,
-        surface: Plane | Cylinder,
-        turn: Array | None = None,
-        offset: Array | None = None,
-    ) -> None:
-        self._surface, self._turn, self._offset = surface, turn, offset
-        self.flat = isinstance(surface, Plane) and turn is None
+    pose: rotation (3, 3) and offset (3,) [m] of the frame that contacts are given in: p' = turn p + offset.
+    """
+
+    def __init__(self, surface: Plane | Cylinder, pose: tuple[Array, Array] | None = None) -> None:
+        self._surface, self._pose = surface, pose
+        self.flat = isinstance(surface, Plane) and pose is None
 
     def __call__(self, x: float, y: float) -> Placed:
         found = self._surface(x, y)
-        if self._turn is None:
+        if self._pose is None:
             return found
-        return found.turned(self._turn, np.zeros(3) if self._offset is None else self._offset)
+        turn, offset = self._pose
+        return Placed(turn @ found.point + offset, turn @ found.normal, turn @ found.along_x, turn @ found.along_y)
+
+
+def placement(skin: Skin, outline: Array, name: str) -> tuple[Placement, str]:
+    """Where contacts are, as skin.toml says, and the name of the frame that they are given in. outline (n, 2) [m]: the
+    sheet's. Raises ConfigError where the sheet does not fit round what it is said to be wrapped round.
+    """
+    surface: Plane | Cylinder = Plane()
+    if skin.surface is not None:
+        surface = Cylinder(skin.surface.radius_m, float(np.radians(skin.surface.axis_degrees)))
+        reach, room = surface.reach_m(outline), 2 * np.pi * surface.radius_m
+        if reach > room * (1 + 1e-6):
+            raise ConfigError(
+                f"skins.{name}.surface: the sheet reaches {1e3 * reach:.0f} mm round a cylinder of {1e3 * room:.0f} "
+                f"mm (radius_m = {surface.radius_m:g}): correct radius_m, or axis_degrees"
+            )
+    if skin.contacts_in == "skin":
+        return Placement(surface), skin.frame_id
+    pose = skin.pose
+    return Placement(surface, (rotation(pose.quaternion_xyzw), np.array(pose.position_m))), pose.parent

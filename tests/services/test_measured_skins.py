@@ -12,8 +12,7 @@ from models.linearise import linearise
 from models.shapes import Shape
 from services.calibration.fields import half_width, sample, sensitivities
 from services.calibration.register_command import register_presses
-from services.contacts.placing import placement
-from services.contacts.surface import Cylinder, Plane, rotation
+from services.contacts.surface import Cylinder, Plane, placement, rotation
 from services.pipeline import Pipeline
 from services.runtime.config import ConfigError, Pose, Skin, Surface
 from tests.services.curves import stages_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,15 @@ def columns(names: tuple[str, ...], x: Array, y: Array, reach: float) -> Array:
     u, v = np.clip(x / reach, -1, 1), np.clip(y / reach, -1, 1)
     values = {"x": u, "y": v, "xx": u * u, "xy": u * v, "yy": v * v, "rr": u * u + v * v}
     return np.column_stack([values[n] for n in names]) if names else np.zeros((len(np.atleast_1d(x)), 0))
+
+
+class Quantity(NamedTuple):
+    """What a law's curve takes."""
+
+    value: float
+    relative: float | None  # standard uncertainty
+    pressure: float | None = None  # Pa, of the shipped foam, where it is highest
+    pressure_sigma: float | None = None
 
 
 @dataclass(frozen=True)

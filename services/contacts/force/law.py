@@ -24,8 +24,8 @@ from protocol.frames import EstimatedTouch, ImageFrame
 from services.contacts.force import calibration_file as calibration
 from services.contacts.force import of_disc
 from services.contacts.force.calibration_file import Of
-from services.contacts.force.curve import Curve
-from services.contacts.force.of_disc import SATURATED, TOLD, flat_drop
+from services.contacts.force.curve import Curve, Quantity
+from services.contacts.force.of_disc import MEASURABLE, SATURATED, flat_drop
 from services.contacts.images.segmentation import Segment
 from services.runtime.config import ConfigError, Skin
 
@@ -61,15 +61,6 @@ class Force(NamedTuple):
 
 
 NOTHING = Force(None, None)
-
-
-class Quantity(NamedTuple):
-    """What a law's curve takes."""
-
-    value: float
-    relative: float | None  # standard uncertainty
-    pressure: float | None = None  # Pa, of the shipped foam
-    pressure_sigma: float | None = None
 
 
 @dataclass(frozen=True)
@@ -126,7 +117,7 @@ class ForceLaw:
         """For info/<skin>."""
         if self.curve is None:
             return None
-        said: dict[str, object] = {
+        described: dict[str, object] = {
             "kind": f"{self.curve.kind} in the {NAMES[self.reads]}",
             "of": self.reads,
             **self.curve.to_dict(),
@@ -134,7 +125,7 @@ class ForceLaw:
             "calibrated": self.calibrated,
             "known_indenter": self.known,
         }
-        return {**said, "foam": self.foam.to_dict()} if self.reads == "pressure" else said
+        return {**described, "foam": self.foam.to_dict()} if self.reads == "pressure" else described
 
     def __str__(self) -> str:
         """For a person: `8.5 N per S/m, to 5 N`."""
@@ -169,10 +160,10 @@ class ForceLaw:
             return Quantity(look.integral, relative)
         drop = look.peak
         if self.indenter_m2 is not None:
-            drop = flat_drop(look.integral / (1 - min(drop, TOLD) / 2) / self.indenter_m2)
+            drop = flat_drop(look.integral / (1 - min(drop, MEASURABLE) / 2) / self.indenter_m2)
         if self.reads == "peak":
             return Quantity(drop, relative)
-        drop = min(drop, TOLD)
+        drop = min(drop, MEASURABLE)
         area = look.integral / drop if self.indenter_m2 is None else self.indenter_m2
         pressure = float(self.foam.pressure(drop))
         spread = None if relative is None else relative * float(self.foam.gain(drop))
@@ -182,27 +173,25 @@ class ForceLaw:
         """Force and standard uncertainty of a touch as the estimator has it. classes: of its shape, by an image."""
         if self.curve is None or not touch.strength > 0:
             return NOTHING
-        return self._said(self._of_estimate(touch, classes), *touch.position)
+        return self._force(self._of_estimate(touch, classes), *touch.position)
 
     def _of_estimate(self, touch: EstimatedTouch, classes: Sequence[float]) -> Quantity:
         area = self.indenter_m2
         if self.reads == "pressure":
-            found = of_disc.force_of(touch, self.foam, area, classes)
-            return Quantity(found.force, found.force_sigma / found.force, found.pressure, found.pressure_sigma)
-        acts = touch.strength / (math.pi * touch.radius_m**2 if area is None else area)
-        drop = flat_drop(acts)
+            return of_disc.force_of(touch, self.foam, area, classes)
         relative = touch.strength_sigma / touch.strength
         if self.reads == "integral":
             return Quantity(touch.strength * (1 - min(touch.drop, 1.0) / 2), relative)
+        drop = flat_drop(touch.strength / (math.pi * touch.radius_m**2 if area is None else area))
         return Quantity(drop, relative if area is not None else touch.drop_sigma / max(drop, 1e-9))
 
     def force(self, look: Look) -> Force:
         """Force and standard uncertainty of a touch as an image shows it."""
         if self.curve is None or not (look.peak > 0 and look.integral > 0):
             return NOTHING
-        return self._said(self.quantity(look), look.x, look.y)
+        return self._force(self.quantity(look), look.x, look.y)
 
-    def _said(self, found: Quantity, x: float, y: float) -> Force:
+    def _force(self, found: Quantity, x: float, y: float) -> Force:
         """A quantity as a force, by the curve; the pressure goes with it."""
         assert self.curve is not None
         newton = self.curve(found.value, x, y)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -19,19 +18,10 @@ from numpy.typing import NDArray
 
 from models.pressure import Foam
 from protocol.frames import SHAPES, EstimatedTouch
+from services.contacts.force.curve import Quantity
 
 Array = NDArray[np.float64]
 Acts = TypeVar("Acts", float, NDArray[np.float64])
-
-
-@dataclass(frozen=True)
-class PatchForce:
-    """Means and standard deviations over what a touch may be."""
-
-    force: float  # N
-    force_sigma: float
-    pressure: float  # Pa, where it is highest
-    pressure_sigma: float
 
 
 class PatchKind(NamedTuple):
@@ -50,8 +40,8 @@ PATCHES = (
 )
 SATURATED = 0.76  # S/m: a touch of such a drop may press harder than it shows
 BLIND = 0.82  # S/m: a drop beyond it may as well be any up to FULL
-TOLD, FULL = 0.97, 0.995  # S/m: nothing tells more; no foam gives more
-LOOKS = 0.85  # of what an image says of the shape, against those shares
+MEASURABLE, FULL = 0.97, 0.995  # S/m: nothing tells more; no foam gives more
+IMAGE_SHARE = 0.85  # of what an image says of the shape, against those shares
 EDGES = ((0.85, 0.0), (0.05, 1.5e-3), (0.05, 2.2e-3), (0.05, 3e-3))  # share of skins, and how soft [m]
 ACTION_SIGMA = 0.025  # relative: of the response of discs, 0.98 to 1.04 on another mesh
 MOST_ACTS = 2.2  # action over area: 2 where nothing conducts, and that response's error
@@ -69,9 +59,9 @@ class Discs(NamedTuple):
     drop: Array
 
 
-def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None, classes: Sequence[float] = ()) -> PatchForce:
-    """The foam's pressure at a patch's drop over its area, a mean over the radii and actions that the fit leaves, and
-    over PATCHES and EDGES. A patch that may have saturated has a force from below only: its sigma reaches to where the
+def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None, classes: Sequence[float] = ()) -> Quantity:
+    """Force [N]: the foam's pressure at a patch's drop over its area, a mean over the radii and actions that the fit
+    leaves, and over PATCHES and EDGES. A patch that may have saturated has a force from below only: its sigma reaches to where the
     foam tells nothing more. area [m^2]: of what presses, where it is known. classes: probabilities of SHAPES by an
     image; empty: none tells.
     """
@@ -84,18 +74,8 @@ def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None, class
     pressure = foam.pressure(drop)
     beyond = (float(foam.pressure(FULL)) - pressure) * (drop > BLIND)
     creeps = CREEPS * (1 - math.exp(-max(touch.age_s, 0.0) / CREEPS_S))
-    return PatchForce(
-        *_moments(each.area * pressure, weight, each.area * beyond, creeps), *_moments(pressure, weight, beyond, creeps)
-    )
-
-
-def _shares(classes: Sequence[float]) -> list[float]:
-    """Of PATCHES, as an image shows the touch."""
-    before = [patch.share for patch in PATCHES]
-    if not classes:
-        return before
-    seen = [sum(classes[SHAPES.index(name)] for name in patch.names) for patch in PATCHES]
-    return [LOOKS * now + (1 - LOOKS) * then for now, then in zip(seen, before, strict=True)]
+    force, sigma = _moments(each.area * pressure, weight, each.area * beyond, creeps)
+    return Quantity(force, sigma / force, *_moments(pressure, weight, beyond, creeps))
 
 
 def _moments(values: Array, weight: Array, beyond: Array, creeps: float) -> tuple[float, float]:
@@ -109,13 +89,17 @@ def _of_area(strength: float, sigma: float, area: float) -> Discs:
     """Under an indenter of known area: only how strongly it acts is open."""
     action_sd = math.hypot(sigma, ACTION_SIGMA * strength)
     seen = np.maximum(strength + action_sd * SPREAD, 0.0) / area
-    drop = np.minimum(flat_drop(seen), TOLD)
+    drop = np.minimum(flat_drop(seen), MEASURABLE)
     return Discs(WEIGHT, np.full(drop.shape, area), drop)
 
 
 def _of_any_patch(touch: EstimatedTouch, classes: Sequence[float]) -> Discs:
     """Under what nobody knows: any of PATCHES, with any of EDGES."""
-    patches = [patch._replace(share=share) for patch, share in zip(PATCHES, _shares(classes), strict=True)]
+    patches: tuple[PatchKind, ...] = PATCHES
+    if classes:  # what an image shows of the shape
+        shown = [sum(classes[SHAPES.index(name)] for name in patch.names) for patch in PATCHES]
+        shares = [IMAGE_SHARE * s + (1 - IMAGE_SHARE) * patch.share for s, patch in zip(shown, PATCHES, strict=True)]
+        patches = tuple(patch._replace(share=share) for patch, share in zip(PATCHES, shares, strict=True))
     sharp = [_seen_as(touch, patch) for patch in patches]
     found = [_through(seen, edge, share) for seen in sharp for share, edge in EDGES]
     each = Discs(*map(np.concatenate, zip(*found, strict=True)))

@@ -5,7 +5,7 @@ skin's response map finds them. Each has the number of the one that was nearest 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from models.bundle import Bundle
@@ -37,23 +37,23 @@ class ImageTouches:
         if not frame.image.size or not readable(frame.image):
             return []
         image = Pixels(frame.metres_per_pixel, frame.origin)
-        places = [touch.position for touch in frame.touches] or [[look.x, look.y] for look in before.values()]
-        pixels = [image.at(x, y) for x, y in places]
-        if not frame.touches:
-            return [self._touch(frame, s, None) for s in segment(frame.image, frame.sigma, pixels)]
-        parts = divided(frame.image, frame.sigma, pixels)
-        return [self._touch(frame, s, touch) for s, touch in zip(parts, frame.touches, strict=True)]
+        located: Sequence[LocatedTouch | None] = frame.touches
+        if located:
+            places = [(x, y) for x, y in (touch.position for touch in frame.touches)]
+            parts = divided(frame.image, frame.sigma, [image.at(*place) for place in places])
+        else:
+            parts = segment(frame.image, frame.sigma, [image.at(look.x, look.y) for look in before.values()])
+            places, located = [image.place(s.x, s.y) for s in parts], [None] * len(parts)
+        return [
+            ImageTouch(s, image.appearance(s, frame, *place), s.reach * image.side_m, touch)
+            for s, place, touch in zip(parts, places, located, strict=True)
+        ]
 
     def estimated(self, looks: Appearance, estimates: Iterable[EstimatedTouch]) -> EstimatedTouch | None:
         """A registered skin's touch as the measurements tell it: the nearest that is near enough to be the same."""
         apart = [(math.hypot(t.position[0] - looks.x, t.position[1] - looks.y), k, t) for k, t in enumerate(estimates)]
         distance, _, nearest = min(apart, default=(math.inf, 0, None))
         return nearest if distance < self._same_m else None
-
-    def _touch(self, frame: ImageFrame, s: Segment, located: LocatedTouch | None) -> ImageTouch:
-        m, (x0, y0) = frame.metres_per_pixel, frame.origin
-        x, y = (x0 + (s.x + 0.5) * m, y0 + (s.y + 0.5) * m) if located is None else located.position
-        return ImageTouch(s, Pixels(m, frame.origin).appearance(s, frame, x, y), s.reach * m, located)
 
     def same(self, touches: list[ImageTouch], before: Mapping[int, Appearance]) -> list[int]:
         """Of each touch the number that it had before, the nearest pairs first; 0: it is new."""

@@ -62,7 +62,7 @@ def segment(image: Image, sigma: Image, expected: Sequence[Place] = ()) -> list[
     high = image > 0.5 * floor
     rows, columns = _box(high)
     part = image[rows, columns].astype(np.float64)
-    smooth = ndimage.correlate1d(ndimage.correlate1d(part, KERNEL, 0), KERNEL, 1)
+    smooth = _smoothed(part)
     near = [(x - columns.start, y - rows.start) for x, y in expected]
     labels, count = _labels(smooth, floor, near)
     volumes = np.bincount(labels.ravel(), part.ravel(), count + 1)
@@ -81,7 +81,7 @@ def divided(image: Image, sigma: Image, places: Sequence[Place]) -> list[Segment
     """The same image as touches that are known to be at these (x, y) [pixels], one each, in their order: every pixel is
     the nearest one's. Where the image shows nothing of a touch, its pixel and the four round it.
     """
-    smooth = ndimage.correlate1d(ndimage.correlate1d(image.astype(np.float64), KERNEL, 0), KERNEL, 1)
+    smooth = _smoothed(image.astype(np.float64))
     floor = max(FLOOR, RELATIVE_FLOOR * float(image.max(initial=0.0)))
     y, x = np.indices(image.shape)
     nearest = np.argmin([(x - px) ** 2 + (y - py) ** 2 for px, py in places], axis=0)
@@ -108,6 +108,10 @@ def class_probabilities(s: Segment, classes: NDArray[np.float32]) -> list[float]
     pixels = np.bincount(y * h // s.mask.shape[0] * w + x * w // s.mask.shape[1], minlength=h * w)
     total = classes.reshape(count, h * w) @ pixels.astype(np.float32)
     return [min(1.0, float(p)) for p in total / max(float(total.sum()), 1e-9)]
+
+
+def _smoothed(image: Image) -> Image:
+    return np.asarray(ndimage.correlate1d(ndimage.correlate1d(image, KERNEL, 0), KERNEL, 1))
 
 
 def _box(high: NDArray[np.bool_]) -> tuple[slice, slice]:
@@ -159,9 +163,11 @@ def _measured(
     volume: float,
 ) -> Segment:
     """The touch in numbers; own: its part of the smoothed image, corner: of the box in the whole image."""
+    values = image[mask]
+    peak = values[values >= PLATEAU * values.max()]  # its mean is what one noisy pixel does not move
     noise = sigma[mask] if sigma.size else sigma
     peak_sigma = float(noise.mean()) if noise.size and np.isfinite(noise).all() else 0.0
-    y, x = np.nonzero(_grown(mask))
+    y, x = np.nonzero(ndimage.binary_dilation(mask, FOUR))
     weight = np.clip(2 * own[y, x] / own.max() - 0.5, 0, 1)  # pixels on the edge count in part
     area = float(weight.sum())
     cx, cy = float(weight @ x) / area, float(weight @ y) / area
@@ -169,7 +175,7 @@ def _measured(
     mxx, myy, mxy = (float(weight @ v) / area for v in (dx * dx, dy * dy, dx * dy))
     return Segment(
         mask=whole,
-        peak=_plateau(image[mask]),
+        peak=float(peak.mean()),
         peak_sigma=peak_sigma,
         volume=volume,
         x=cx + corner[0],
@@ -178,18 +184,3 @@ def _measured(
         orientation=0.5 * float(np.arctan2(2 * mxy, mxx - myy)),
         reach=float(np.sqrt((dx * dx + dy * dy).max())),
     )
-
-
-def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The mask and the pixels that share an edge with it."""
-    grown = mask.copy()
-    grown[1:] |= mask[:-1]
-    grown[:-1] |= mask[1:]
-    grown[:, 1:] |= mask[:, :-1]
-    grown[:, :-1] |= mask[:, 1:]
-    return grown
-
-
-def _plateau(values: Image) -> float:
-    """Peak drop of a touch: the mean of its pixels near the highest, which one noisy pixel does not move."""
-    return float(values[values >= PLATEAU * values.max()].mean())
