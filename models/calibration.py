@@ -89,7 +89,8 @@ def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: s
             misses += held_out[-1] > (1 - ENOUGH) * misfit
         if misses == PATIENCE or min(held_out, default=np.inf) < MODEL_ERROR:
             break
-    sd = now.mounting.with_vector(_spread(derivative, variance, live, now.mounting))
+    information = _information(derivative, variance, live, now.mounting)
+    sd = now.mounting.with_vector(np.sqrt(np.diag(np.linalg.inv(information))))
     return CalibrationFit(now.mounting, sd, before, _rms(seen - now.log, live), tuple(held_out))
 
 
@@ -116,17 +117,16 @@ def fields_as_mounted(skin: SkinGeometry, mounting: Mounting, mesh: str = MESH) 
     return mounted_fields(now.model, now.tensors, now.solution.potentials)
 
 
+def _information(derivative: Array, variance: Array, used: NDArray[np.bool_], state: Mounting) -> Array:
+    """(P, P) of the measurements used, and of the prior."""
+    of_measurements = (derivative[used] / variance[used, None]).T @ derivative[used]
+    return np.asarray(of_measurements + np.diag(1 / state.prior_sd**2))
+
+
 def _step(derivative: Array, left: Array, variance: Array, used: NDArray[np.bool_], state: Mounting) -> Array:
-    weighted = derivative[used] / variance[used, None]
-    information = weighted.T @ derivative[used] + np.diag(1 / state.prior_sd**2)
     pull = np.append(0.0, state.vector[1:]) / state.prior_sd**2  # the common factor has no likeliest value
-    return np.asarray(np.linalg.solve(information, weighted.T @ left[used] - pull))
-
-
-def _spread(derivative: Array, variance: Array, used: NDArray[np.bool_], state: Mounting) -> Array:
-    weighted = derivative[used] / variance[used, None]
-    information = weighted.T @ derivative[used] + np.diag(1 / state.prior_sd**2)
-    return np.asarray(np.sqrt(np.diag(np.linalg.inv(information))))
+    gradient = (derivative[used] / variance[used, None]).T @ left[used] - pull
+    return np.asarray(np.linalg.solve(_information(derivative, variance, used, state), gradient))
 
 
 def _moved(mounting: Mounting, step: Array, shifts: Array) -> Mounting:

@@ -17,8 +17,8 @@ def response_tables(model: ForwardModel, coarse: int = COARSE, fine: int = FINE)
     axis = -1 + 2 * (np.arange(coarse) + 0.5) / coarse
     x, y = np.meshgrid(axis, axis)
     inside = np.asarray(model.skin.inside(np.column_stack([x.ravel(), y.ravel()])), dtype=bool)
-    means = _pixel_means(model, fine, _gradients(model, model.solve(1.0).potentials))
-    return ResponseTables(_filled(means, _known(model, fine)).astype(np.float32), inside.reshape(coarse, coarse))
+    fields = _on_pixels(model, fine, _gradients(model, model.solve(1.0).potentials))
+    return ResponseTables(fields, inside.reshape(coarse, coarse))
 
 
 def mounted_fields(model: ForwardModel, tensors: Array, potentials: Array, n: int = FINE) -> npt.NDArray[np.float32]:
@@ -26,8 +26,7 @@ def mounted_fields(model: ForwardModel, tensors: Array, potentials: Array, n: in
     a drop takes a share of what conducts, so their products are to such a sheet what those of fields are to an even
     one. tensors (elements, 3): xx, xy, yy; potentials (nodes, E): of a unit current at each electrode.
     """
-    means = _pixel_means(model, n, _rooted(tensors, _gradients(model, potentials)))
-    return _filled(means, _known(model, n)).astype(np.float32)
+    return _on_pixels(model, n, _rooted(tensors, _gradients(model, potentials)))
 
 
 def _rooted(tensors: Array, field: Array) -> Array:
@@ -46,26 +45,15 @@ def _gradients(model: ForwardModel, potentials: Array) -> Array:
     return np.stack([np.einsum("ek,ekc->ec", model.gradients[..., a], corner) for a in range(2)])
 
 
-def _pixel_means(model: ForwardModel, n: int, values: Array) -> Array:
-    """(2, n * n, c) of values (2, elements, c)."""
-    share = sparse.csr_array(model.element_map(n, 64).T * model.areas)
+def _on_pixels(model: ForwardModel, n: int, values: Array) -> npt.NDArray[np.float32]:
+    """(2, n * n, c) means over pixels of values (2, elements, c). Pixels off the skin take their nearest neighbour's,
+    so that interpolation at the edge has two sides.
+    """
+    elements = model.element_map(n, 64)
+    share = sparse.csr_array(elements.T * model.areas)
     total = np.maximum(np.asarray(share.sum(axis=1)).ravel(), 1e-12)
-    return np.array([share @ part / total[:, None] for part in values])
-
-
-def _known(model: ForwardModel, n: int) -> npt.NDArray[np.bool_]:
-    return np.asarray(model.element_map(n, 64).sum(axis=0) > 0).ravel()
-
-
-def _filled(values: Array, known: npt.NDArray[np.bool_]) -> Array:
-    """Pixels off the skin take their nearest neighbour's values, so that interpolation at the edge has two sides."""
-    n = round(len(known) ** 0.5)
-    iy, ix = np.divmod(np.arange(n * n), n)
-    return values[:, _nearest(np.column_stack([ix, iy]).astype(float), known)]
-
-
-def _nearest(points: Array, known: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
-    """For each point the nearest that is known."""
-    there = np.flatnonzero(known)
-    distance = ((points[:, None] - points[None, there]) ** 2).sum(axis=2)
-    return np.asarray(there[distance.argmin(axis=1)], dtype=np.int64)
+    means = np.array([share @ part / total[:, None] for part in values])
+    on_skin = np.flatnonzero(np.asarray(elements.sum(axis=0) > 0).ravel())
+    points = np.column_stack(np.divmod(np.arange(n * n), n)[::-1]).astype(float)
+    nearest = ((points[:, None] - points[None, on_skin]) ** 2).sum(axis=2).argmin(axis=1)
+    return means[:, on_skin[nearest]].astype(np.float32)

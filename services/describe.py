@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,10 +20,10 @@ from services.runtime.stage import SEPARATE
 
 ON = "on"
 CORNERS = 64  # of the polygon that stands for a disc
-MOVED = 2e-4  # relative: as two frames of 80 dB differ; a baseline that drifted by more is told again
+MOVED = 2e-4  # relative: as two frames of 80 dB differ; a baseline that drifted by more is sent again
 EVERY_S = 5.0  # but that at most so often
 RATE_FRAMES = 16  # of which the median time between two scans is taken
-RATE_CHANGED = 0.1  # relative: a rate that changed by more is told again
+RATE_CHANGED = 0.1  # relative: a rate that changed by more is sent again
 
 UNITS = {"z": "ohm", "image": "S/m", "position": "m", "velocity": "m/s", "area_m2": "m^2", "force_n": "N"}
 
@@ -31,8 +32,7 @@ def force(skin: Skin, bundle: Bundle) -> dict[str, Any]:
     """The part of the map that says how forces are found. bundle: as it was loaded, which a calibration of forces names
     whatever a tare finds about the mounting. Read once, at the start, as the publisher does. Raises ConfigError.
     """
-    law = ForceLaw.of(skin, bundle).describe()
-    file = skin.calibration
+    law, file = ForceLaw.of(skin, bundle).describe(), skin.calibration
     return {
         "force_law": law,
         "calibration_hash": None if file is None else hashlib.sha256(file.read_bytes()).hexdigest(),
@@ -50,12 +50,14 @@ def describe(
     """The map of an InfoFrame: bundle (the one in use), geometry, pose, units, the rate of frames, what `force` said
     and, once there is one, the baseline.
     """
+    ladder = np.asarray(bundle.matrices.ladder, dtype=float)
+    nearest = np.argmin(np.abs(np.log(ladder) - 2 * np.log(ONE_STEP_LAMBDA)))
     found: dict[str, Any] = {
         "bundle": bundle.name,
         "bundle_hash": bundle.hash,
         "geometry": geometry(bundle),
         "pattern": bundle.skin.get("pattern", ""),
-        "stack": _stack(bundle),
+        "stack": {"lambda_squared": ladder.tolist(), "one_step": int(nearest)},
         "frame_id": skin.frame_id,
         "parent_frame_id": skin.pose.parent,
         "pose": [*skin.pose.position_m, *skin.pose.quaternion_xyzw],
@@ -69,12 +71,6 @@ def describe(
         found["baseline_revision"] = revision
         found |= {"tare_sample_ns": baseline.taken_ns, "tare": provenance(baseline, bundle)}
     return found
-
-
-def _stack(bundle: Bundle) -> dict[str, Any]:
-    ladder = np.asarray(bundle.matrices.ladder, dtype=float)
-    nearest = np.argmin(np.abs(np.log(ladder) - 2 * np.log(ONE_STEP_LAMBDA)))
-    return {"lambda_squared": ladder.tolist(), "one_step": int(nearest)}
 
 
 def symmetry(skin: Skin, bundle: Bundle) -> str:
@@ -118,15 +114,18 @@ class FrameRate:
         self._steps_ns.clear()
         if step_ns > 0:
             touched = 1e9 / step_ns
-            told = 0.0 if self.found is None else self.found["touched"]
-            if abs(touched - told) > RATE_CHANGED * touched:
+            announced = 0.0 if self.found is None else self.found["touched"]
+            if abs(touched - announced) > RATE_CHANGED * touched:
                 self.found = {"least": round(touched / frame.parts, 2), "touched": round(touched, 2)}
 
 
 class _Announced(NamedTuple):
     baseline: Baseline | None
-    origin: tuple[Any, ...]
+    origin: tuple[Any, ...]  # its rate, and what drift leaves of a baseline as the tare found it
     at_ns: int
+
+
+_ORIGIN = attrgetter("taken_ns", "taken_by", "restored", "frames", "board", "doubt")
 
 
 class BaselineNews:
@@ -135,27 +134,21 @@ class BaselineNews:
     """
 
     def __init__(self) -> None:
-        self._told: _Announced | None = None
+        self._sent: _Announced | None = None
 
     def __call__(self, baseline: Baseline | None, now_ns: int, rate_hz: dict[str, float] | None = None) -> bool:
-        """True: the caller tells it now. now_ns: stamp `sample` of the newest frame. rate_hz: told anew as it is
+        """True: the caller sends it now. now_ns: stamp `sample` of the newest frame. rate_hz: sent anew as it is
         another.
         """
-        told = self._told
-        rate = tuple((rate_hz or {}).values())
-        found = _Announced(baseline, (rate, *(() if baseline is None else _origin(baseline))), now_ns)
-        if told is not None and told.origin == found.origin:
-            if told.baseline is None or baseline is None or abs(now_ns - told.at_ns) < EVERY_S * 1e9:
+        sent, rate = self._sent, tuple((rate_hz or {}).values())
+        origin = rate, None if baseline is None else _ORIGIN(baseline)
+        if sent is not None and sent.origin == origin:
+            if sent.baseline is None or baseline is None or abs(now_ns - sent.at_ns) < EVERY_S * 1e9:
                 return False
-            if not (np.abs(baseline.z0 - told.baseline.z0) > MOVED * np.abs(told.baseline.z0)).any():
+            if not (np.abs(baseline.z0 - sent.baseline.z0) > MOVED * np.abs(sent.baseline.z0)).any():
                 return False
-        self._told = found
+        self._sent = _Announced(baseline, origin, now_ns)
         return True
-
-
-def _origin(baseline: Baseline) -> tuple[Any, ...]:
-    """Of the tare: what drift leaves as it is."""
-    return (baseline.taken_ns, baseline.taken_by, baseline.restored, baseline.frames, baseline.board, baseline.doubt)
 
 
 def provenance(baseline: Baseline, bundle: Bundle) -> dict[str, Any]:

@@ -61,9 +61,9 @@ class Discs(NamedTuple):
 
 def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None, classes: Sequence[float] = ()) -> Quantity:
     """Force [N]: the foam's pressure at a patch's drop over its area, a mean over the radii and actions that the fit
-    leaves, and over PATCHES and EDGES. A patch that may have saturated has a force from below only: its sigma reaches to where the
-    foam tells nothing more. area [m^2]: of what presses, where it is known. classes: probabilities of SHAPES by an
-    image; empty: none tells.
+    leaves, and over PATCHES and EDGES. A patch that may have saturated has a force from below only: its sigma reaches
+    to where the foam tells nothing more. area [m^2]: of what presses, where it is known. classes: probabilities of
+    SHAPES by an image; empty: none tells.
     """
     if area is not None:
         each = _of_area(touch.strength, touch.strength_sigma, area)
