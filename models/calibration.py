@@ -54,7 +54,7 @@ class CalibrationFit:
     held_out: tuple[float, ...]  # of the held-out parts after each step that counted
 
 
-def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: str = STEPS_MESH) -> CalibrationFit:
+def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array) -> CalibrationFit:
     """z0 (K,): |Z| of the untouched skin in the order of its pattern, 0 where not measured; any unit. sigma (K,): its
     standard deviation, same unit, infinite where not measured. matrices: the bundle's. Raises TooFewMeasured.
     """
@@ -67,7 +67,7 @@ def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: s
         )
     variance = np.where(live, (sigma / np.where(live, z0, 1.0)) ** 2 + MODEL_ERROR**2, np.inf)
     modes, bounds = FieldModes(skin), most_shift(skin)
-    now = Predicted(skin, Mounting.nominal(skin, modes.count), modes, mesh)
+    now = Predicted(skin, Mounting.nominal(skin, modes.count), modes, STEPS_MESH)
     seen = np.log(np.where(live, z0, 1.0)) - np.log(matrices.z0) + now.log  # less what this mesh gets wrong
     now.mounting = replace(now.mounting, log_gain=float(np.median((seen - now.log)[live])))
     before = _rms(seen - now.log, live)
@@ -79,7 +79,7 @@ def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: s
         left = live & (part == k % PARTS)
         step = _step(derivative, seen - now.log, variance, live & ~left, now.mounting)
         misfit = _rms(seen - now.log, left)
-        tried = (Predicted(skin, _moved(now.mounting, share * step, bounds), modes, mesh) for share in SHORTER)
+        tried = (Predicted(skin, _moved(now.mounting, share * step, bounds), modes, STEPS_MESH) for share in SHORTER)
         better = next((each for each in tried if _rms(seen - each.log, left) < misfit), None)
         if better is None:
             misses += 1
@@ -94,11 +94,11 @@ def fit(skin: SkinGeometry, matrices: Matrices, z0: Array, sigma: Array, mesh: s
     return CalibrationFit(now.mounting, sd, before, _rms(seen - now.log, live), tuple(held_out))
 
 
-def calibrated(matrices: Matrices, skin: SkinGeometry, mounting: Mounting, mesh: str = MESH) -> Matrices:
+def calibrated(matrices: Matrices, skin: SkinGeometry, mounting: Mounting) -> Matrices:
     """The bundle's matrices, linearised about the skin as it is mounted. What the network was trained to see, the
     ladder of lambda and the levels of its images, stays.
     """
-    now = Predicted(skin, replace(mounting, log_gain=0.0), FieldModes(skin), mesh)
+    now = Predicted(skin, replace(mounting, log_gain=0.0), FieldModes(skin), MESH)
     grid = matrices.inside.shape[0]
     made = linearise(now.model, matrices.normalisation, grid, matrices.model_error, now.tensors)
     return replace(
@@ -111,9 +111,9 @@ def calibrated(matrices: Matrices, skin: SkinGeometry, mounting: Mounting, mesh:
     )
 
 
-def fields_as_mounted(skin: SkinGeometry, mounting: Mounting, mesh: str = MESH) -> NDArray[np.float32]:
+def fields_as_mounted(skin: SkinGeometry, mounting: Mounting) -> NDArray[np.float32]:
     """(2, F * F, E) fields of the bundle's response tables, of the skin as it is mounted."""
-    now = Predicted(skin, replace(mounting, log_gain=0.0), FieldModes(skin), mesh)
+    now = Predicted(skin, replace(mounting, log_gain=0.0), FieldModes(skin), MESH)
     return mounted_fields(now.model, now.tensors, now.solution.potentials)
 
 

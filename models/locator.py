@@ -44,8 +44,9 @@ class Located:
     def sigma(self) -> list[float]:
         """Standard uncertainty along the longest and the shortest axis [m], angle of the longest to x [rad]."""
         values, vectors = np.linalg.eigh(self.covariance)
+        short, long = np.sqrt(np.maximum(values, 0.0)).tolist()
         angle = float(np.arctan2(vectors[1, 1], vectors[0, 1]))
-        return [float(np.sqrt(max(values[1], 0.0))), float(np.sqrt(max(values[0], 0.0))), _half_turn(angle)]
+        return [long, short, float((angle + np.pi / 2) % np.pi - np.pi / 2)]  # an axis has no direction
 
 
 @dataclass(frozen=True)
@@ -125,11 +126,11 @@ class Locator:
         for n in range(len(chosen)):
             others = np.delete(np.arange(len(chosen)), n)
             own = z - amplitudes[others] @ now.r[chosen[others]]
-            found.append(self.single(now, own, len(chosen)))
+            found.append(self._single(now, own, len(chosen)))
         return sorted((touch for touch in found if touch is not None), key=lambda touch: -touch.amplitude)
 
-    def single(self, now: WhitenedMap, z: Array, touches: int = 1) -> Located | None:
-        """The one touch that explains a whitened difference."""
+    def _single(self, now: WhitenedMap, z: Array, touches: int) -> Located | None:
+        """The one touch that explains a whitened difference; touches: how many there are in all."""
         seen = self.seen(now, z)
         if seen is None:
             return None
@@ -138,8 +139,8 @@ class Locator:
             place = place + self._place(features[:-1])[0]
         value, value_sigma = None, None
         if self._press is not None:
-            said, unsure = self._press(features)
-            value, value_sigma = max(float(said[0]), 0.0), float(unsure[0]) * touches
+            mean, sigma = self._press(features)
+            value, value_sigma = max(float(mean[0]), 0.0), float(sigma[0]) * touches
         whole = uncertain(seen.covariance, self.a.spread, doubt(seen, float(self.a.misfit)))
         return Located(float(place[0]), float(place[1]), whole, seen.amplitude, value, value_sigma)
 
@@ -262,8 +263,3 @@ def _amplitudes(now: WhitenedMap, z: Array, chosen: npt.NDArray[np.intp]) -> Arr
 def unit(whitened: Array) -> Array:
     """Whitened differences (..., K) of unit length: their form, whatever the amplitude."""
     return np.asarray(whitened / np.maximum(np.linalg.norm(whitened, axis=-1, keepdims=True), 1e-30))
-
-
-def _half_turn(angle: float) -> float:
-    """An axis has no direction: -pi/2 to pi/2."""
-    return float((angle + np.pi / 2) % np.pi - np.pi / 2)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from models.bundle import Bundle
-from models.calibration_file import CalibrationFileError, found_by
+from models.calibration_file import CalibrationFileError
 from services.estimation.initialisation.baseline import Baseline
 from services.mounting import MountedSkin, MountingFit, keep, kept, needs_fit
 
@@ -49,11 +49,6 @@ class Linearisation:
     @property
     def name(self) -> str:
         return "" if self.mounted is None else self.mounted.bundle.hash
-
-    @property
-    def found(self) -> dict[str, Any] | None:
-        """What the calibration in use says of the skin, for info/<skin>."""
-        return found_by(self.bundle)
 
     @property
     def problem(self) -> str:

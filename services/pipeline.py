@@ -55,26 +55,23 @@ class Pipeline:
 
     def run(self, raw: RawFrame) -> Result:
         """What the processes would publish for one raw frame, which is a whole scan; stamps are filled in."""
-        made = self._passed(self.pre, raw)
-        assert made, "a part of a scan: only `step` takes those"
-        image = self._passed(self.inference, made[0])[0]
-        contact = self._passed(self.publishing, image)[0]
-        delta = made[0]
-        assert isinstance(delta, DeltaFrame) and isinstance(image, ImageFrame) and isinstance(contact, ContactFrame)
-        return Result(delta, image, contact, self.pre.judgements)
+        self.delta = self.image = None
+        contact = self.step(raw)
+        assert contact and self.delta and self.image, "a part of a scan: only `step` takes those"
+        return Result(self.delta, self.image, contact, self.pre.judgements)
 
     def step(self, raw: RawFrame) -> ContactFrame | None:
         """The contacts alone; None for a part of a scan that only preprocessing takes note of."""
         made = self._passed(self.pre, raw)
         if not made:
             return None
-        said = made[0]
-        if isinstance(said, DeltaFrame):
-            self.delta = said
-            said = self._passed(self.inference, said)[0]
-            assert isinstance(said, ImageFrame)
-            self.image = said
-        contact = self._passed(self.publishing, said)[0]
+        frame = made[0]
+        if isinstance(frame, DeltaFrame):
+            self.delta = frame
+            (frame,) = self._passed(self.inference, frame)
+            assert isinstance(frame, ImageFrame)
+            self.image = frame
+        (contact,) = self._passed(self.publishing, frame)
         assert isinstance(contact, ContactFrame)
         return contact
 

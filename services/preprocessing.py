@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
+from models.calibration_file import found_by
 from protocol.frames import DeltaFrame, EstimatedTouch, Frame, PartFrame, RawFrame, as_sent
 from services.contacts.lasting import LASTS_NS
 from services.describe import BaselineNews, FrameRate, describe, force, symmetry
@@ -465,7 +466,8 @@ class Preprocessing(Stage):
             self.revision, self._announced_hash = self.revision + 1, baseline.hash
         info = describe(self.config, self.bundle, self._force, baseline, self.revision, rate_hz)
         info["symmetry"] = self._symmetry
-        return info | {"mounting": self.linearisation.found} if self.linearisation.found else info
+        mounting = found_by(self.bundle)
+        return info | {"mounting": mounting} if mounting else info
 
     def health(self) -> Health:
         problem = self._foreign or self._problem

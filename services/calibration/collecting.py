@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from protocol.frames import ImageFrame, RawFrame
 from protocol.whole_file import whole_file, write_whole
 from services.calibration.force_fit import CalibrationError
-from services.calibration.force_presses import PATIENCE_S, Reader, Steady
+from services.calibration.force_presses import Reader, Steady
 from services.calibration.seen import SeenTouch, TouchReader
 from services.polygon import distance, inside
 
@@ -40,9 +40,7 @@ class Collected:
 class Collector:
     """Follows raw and image frames of one skin. Use: `untouched`, then press, then `pressed`, then release."""
 
-    def __init__(
-        self, reader: Reader, read: TouchReader, clock: Callable[[], float], patience_s: float = PATIENCE_S
-    ) -> None:
+    def __init__(self, reader: Reader, read: TouchReader, clock: Callable[[], float], patience_s: float) -> None:
         self._reader, self._read, self._clock, self._patience_s = reader, read, clock, patience_s
         self._raw: dict[int, Array] = {}  # scan -> |Z|, of the scans that no image has been seen of yet
         self._images: dict[int, ImageFrame] = {}  # the other way round: they come over two sockets
@@ -117,12 +115,12 @@ def _keep(of: dict[int, Any], scan: int, value: Any) -> None:
         del of[next(iter(of))]
 
 
-def places(outline: Array, n: int, margin: float, seed: int = 0) -> Array:
+def places(outline: Array, n: int, margin: float) -> Array:
     """(n, 2) places spread over a skin, no nearer to its outline (m, 2) than `margin` [m]: for a stub to be pressed at.
 
     Of many random places, each next one is the farthest from those chosen before.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     low, high = outline.min(axis=0), outline.max(axis=0)
     tried = rng.uniform(low, high, (4000, 2))
     tried = tried[inside(outline, *tried.T) & (distance(outline, tried) >= margin)]

@@ -21,7 +21,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from models.pressure import FOAM, disc
+from models.pressure import disc
 from protocol.errors import EitskinError
 from services.calibration.seen import KINDS, SeenTouch
 from services.contacts.force.calibration_file import Calibration, Of
@@ -118,7 +118,7 @@ def fit(presses: Sequence[Press], most_n: float | None = None, any_tip: bool = F
     own = float(np.sqrt(max(0.0, error**2 - float(np.mean((exponent * known) ** 2)))))
     forces = [p.force_n for p in presses]
     scatter, between = error * math.sqrt(form.parameters / len(presses)), _between_tips(presses, left_out)
-    said = {
+    origin = {
         "error": {
             "left_out_rms": error,
             "left_out_median": float(np.median(np.abs(np.expm1(left_out)))),
@@ -130,7 +130,7 @@ def fit(presses: Sequence[Press], most_n: float | None = None, any_tip: bool = F
         "forces_n": [min(forces), max(forces)],
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    return Calibration(curve, form.reads, most_n or max(forces), own, form.tip_m, said)
+    return Calibration(curve, form.reads, most_n or max(forces), own, form.tip_m, origin)
 
 
 def tips(presses: Sequence[Press]) -> list[float]:
@@ -157,7 +157,7 @@ def _between_tips(presses: Sequence[Press], left_out: Array) -> float:
 
 def unknown(found: Calibration, skin: Skin) -> str:
     """What presses of one size of tip leave unknown, for a person; "" where there is nothing."""
-    sizes = found.said.get("tips_m", [])
+    sizes = found.origin.get("tips_m", [])
     if len(sizes) > 1 or skin.indenter is not None:
         return ""
     were = f"all presses were of one tip, radius {1e3 * sizes[0]:g} mm" if sizes else "nobody said what pressed"
@@ -198,7 +198,7 @@ def _table(presses: Sequence[Press], of_one_tip: bool) -> Table:
 def _under(radius_m: float, presses: Sequence[Press]) -> Array:
     """(N,) log of the pressure over a tip."""
     each = [p.seen.strength for p in presses]
-    return np.log([pressure_under(s.value, s.value * (s.relative or 0.0), disc(radius_m), FOAM) for s in each])
+    return np.log([pressure_under(s.value, s.value * (s.relative or 0.0), disc(radius_m)) for s in each])
 
 
 def _forms(n: int, kinds: Sequence[Of], tip_m: float | None) -> list[Form]:
@@ -220,12 +220,12 @@ def _rises(table: Table, form: Form) -> bool:
     return not form.free_exponent or bool(_solve(table, form)[1] > LEAST_EXPONENT)
 
 
-def _residuals(table: Table, form: Form) -> Array:
-    """(N,) of log force, each press left out."""
+def _error(table: Table, form: Form) -> float:
+    """Root mean square of log force, each press left out."""
     a, y = table.design(form)
     hat = a @ np.linalg.pinv(a)
     slack = np.maximum(1 - np.diag(hat), 1e-6)
-    return np.asarray((y - hat @ y) / slack)
+    return float(np.sqrt(np.mean(((y - hat @ y) / slack) ** 2)))
 
 
 def _choose(table: Table) -> Form:
@@ -237,19 +237,12 @@ def _choose(table: Table) -> Form:
             "harder presses do not act more strongly, neither by pressure nor by peak nor by integral: expected them "
             "to; check that each force belongs to its press"
         )
-    forms = [f for f in _forms(len(table.force), rising, _likeliest_tip(table)) if _rises(table, f)]
+    # By the likeliest tip's pressure force is most nearly a constant share.
+    tip_m = min(table.of_tip, key=lambda radius: float(np.var(table.force - table.of_tip[radius])), default=None)
+    forms = [f for f in _forms(len(table.force), rising, tip_m) if _rises(table, f)]
     errors = {f: _error(table, f) * (OF_ONE_TIP if f.tip_m is not None else 1.0) for f in forms}
     limit = NEARLY * min(errors.values())
     return next(f for f in forms if errors[f] <= limit)
-
-
-def _error(table: Table, form: Form) -> float:
-    return float(np.sqrt(np.mean(_residuals(table, form) ** 2)))
-
-
-def _likeliest_tip(table: Table) -> float | None:
-    """By whose pressure force is most nearly a constant share."""
-    return min(table.of_tip, key=lambda radius: float(np.var(table.force - table.of_tip[radius])), default=None)
 
 
 def _left_out(table: Table) -> Array:

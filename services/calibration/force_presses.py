@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -63,32 +64,29 @@ class Reader(Protocol):
     def recv(self, timeout_s: float = 0.0) -> Frame | None: ...
 
 
-def wait_for_press(
-    reader: Reader, read: TouchReader, clock: Callable[[], float], patience_s: float = PATIENCE_S
-) -> SeenTouch:
+def wait_for_press(reader: Reader, read: TouchReader) -> SeenTouch:
     """The next steady press. Raises CalibrationError where none comes."""
-    steady, end = Steady(), clock() + patience_s
+    steady, end = Steady(), time.monotonic() + PATIENCE_S
     received = False
-    while clock() < end:
+    while time.monotonic() < end:
         frame = reader.recv(0.5)
         if isinstance(frame, ImageFrame):
             received = True
-            pressed = steady(read(frame), frame.stamps.get("sample", 0))
-            if pressed is not None:
+            if (pressed := steady(read(frame), frame.stamps.get("sample", 0))) is not None:
                 return pressed
     if not received:
-        raise CalibrationError(f"no image came within {patience_s:g} s: start the service with `skin up`")
-    raise CalibrationError(f"no steady press within {patience_s:g} s: {steady.trouble}")
+        raise CalibrationError(f"no image came within {PATIENCE_S:g} s: start the service with `skin up`")
+    raise CalibrationError(f"no steady press within {PATIENCE_S:g} s: {steady.trouble}")
 
 
-def wait_for_release(reader: Reader, clock: Callable[[], float], patience_s: float = PATIENCE_S) -> None:
+def wait_for_release(reader: Reader) -> None:
     """Wait until nothing touches. Raises CalibrationError where that does not happen."""
-    end = clock() + patience_s
-    while clock() < end:
+    end = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end:
         frame = reader.recv(0.5)
         if isinstance(frame, ImageFrame) and not frame.touched:
             return
-    raise CalibrationError(f"something still touches after {patience_s:g} s: free the skin, or tare (`skin tare`)")
+    raise CalibrationError(f"something still touches after {PATIENCE_S:g} s: free the skin, or tare (`skin tare`)")
 
 
 def of_file(path: Path, skin: Skin, bundle: Bundle, warn: Callable[[str], None]) -> Callable[[int], SeenTouch]:

@@ -37,27 +37,21 @@ OF_A_TIP = LEAST_PRESSES // 2  # of the tip that presses: a law of two tips was 
 ENOUGH = 0.015  # relative standard uncertainty of the law: with so much nobody needs to press on
 QUARTERS = {(1, 1): "upper right", (-1, 1): "upper left", (-1, -1): "lower left", (1, -1): "lower right"}
 
-Tell = Callable[[str], None]
-
 
 class LivePresses:
-    """The presses that are made from now on. tell: takes a line for who presses."""
+    """The presses that are made from now on. show: takes a line for who presses."""
 
-    def __init__(
-        self, skin: str, read: TouchReader, tell: Tell, tip_m: float | None = None, patience_s: float = PATIENCE_S
-    ) -> None:
+    def __init__(self, skin: str, read: TouchReader, show: Callable[[str], None], tip_m: float | None) -> None:
         self.reference = ReferenceForce(skin)
-        self._read = read
-        self._skin, self._tell_all, self._tip, self._patience_s = skin, tell, tip_m, patience_s
+        self._read, self._show, self._tip = read, show, tip_m
         self._reader = AllReader(["image", "reference"], skin)
         self._ages = Ages()
-        self._told = ""
+        self._shown = ""  # last
         self._counts = 0, 0  # of messages that could not be read, and that came again
         self._unread = -math.inf, ""  # when such a message came last [s], and what was wrong with it
         self._course: deque[tuple[float, float]] = deque(maxlen=COURSE)
         self._images = 0
         self._seen = SeenTouches([], [])  # in the newest frame
-        self._held_up = ""
 
     def __iter__(self) -> Iterator[Press]:
         """Each press that counts. Raises CalibrationError where none comes within the patience."""
@@ -121,15 +115,14 @@ class LivePresses:
 
     def _steady(self) -> tuple[SeenTouch, tuple[float, float]]:
         """What a press shows once it is steady, and from when to when that was. Raises Doubtful."""
-        steady = Steady()
-        self._held_up = "too short"
+        steady, trouble_before = Steady(), "too short"
         for frame, now in self._frames("no steady press"):
             if trouble := self._trouble(now):
                 raise Doubtful(trouble)
             seen = steady(self._seen, frame.stamps.get("sample", 0))
             if not frame.touched:
-                raise Doubtful(f"released before it was steady ({self._held_up}): hold still until told")
-            self._held_up = steady.trouble
+                raise Doubtful(f"released before it was steady ({trouble_before}): hold still until told")
+            trouble_before = steady.trouble
             if seen is not None:
                 end = self._when(frame, now)
                 return seen, (end - STEADY_S, end)
@@ -138,7 +131,7 @@ class LivePresses:
     # -- what comes ---------------------------------------------------------------------------------------------------
     def _frames(self, why: str) -> Iterator[tuple[ImageFrame, float]]:
         """Image frames, and when each came [s]; the reference is followed beside them. Raises CalibrationError."""
-        end = time.monotonic() + self._patience_s
+        end = time.monotonic() + PATIENCE_S
         while (now := time.monotonic()) < end:
             frame: Frame | None = self._reader.recv(min(0.5, end - now))
             arrived = time.monotonic()
@@ -154,7 +147,7 @@ class LivePresses:
             why = "no image came: start the service with `skin up`"
         elif trouble := self._trouble(time.monotonic()):
             why = trouble
-        raise CalibrationError(f"no press within {self._patience_s:g} s: {why}")
+        raise CalibrationError(f"no press within {PATIENCE_S:g} s: {why}")
 
     def _note(self, frame: ImageFrame, now: float) -> None:
         """A point of the course: of frames that show something, or that nothing touches."""
@@ -183,9 +176,9 @@ class LivePresses:
 
     def _tell(self, text: str, again: bool = False) -> None:
         """Once, unless `again`."""
-        if again or text != self._told:
-            self._tell_all(text)
-        self._told = text
+        if again or text != self._shown:
+            self._show(text)
+        self._shown = text
 
 
 def missing(presses: Sequence[Press], found: Calibration) -> str:
@@ -198,5 +191,5 @@ def missing(presses: Sequence[Press], found: Calibration) -> str:
     pressed = {(1 if p.seen.x > 0 else -1, 1 if p.seen.y > 0 else -1) for p in presses}
     if left := [name for quarter, name in QUARTERS.items() if quarter not in pressed]:
         return f"presses in the {', '.join(left)} quarter"
-    scatter = found.said["error"]["scatter"]
+    scatter = found.origin["error"]["scatter"]
     return f"the law to {100 * ENOUGH:.1f} %" if scatter > ENOUGH else ""

@@ -27,6 +27,7 @@ SHARES = (1e-3, 0.1, 1.0, 10.0)  # of the sensitivities, beside the field's vari
 MOST_FOR_LENGTH = 300  # presses from which length, noise and share are found
 DIAGONALS = (0.1, 0.2, 0.35, 0.5, 0.7, 0.9)  # share of the residuals' diagonal in their covariance
 COVARIANCE_FOLDS = 5
+ROUNDS = 2  # in which maps and strengths are found from each other
 AMPLITUDES = (0.3, 3.0)  # of what a press's depth leads to expect
 
 
@@ -55,9 +56,9 @@ class ResponseFit:
 
     def at(self, machine: Array) -> Array:
         """(P, 2) m of the machine's frame -> (P, K) difference by a mean press there."""
-        physics = sample(self._fields(), self.similarity.to_skin(machine), half_width(self.bundle)) / self.norm
+        fields, half = sensitivities(self.bundle, BLUR), half_width(self.bundle)
+        physics, fitted = (sample(fields, self.similarity.to_skin(at), half) / self.norm for at in (machine, self.xy))
         known = self.strength[:, None] * self.alpha
-        fitted = sample(self._fields(), self.similarity.to_skin(self.xy), half_width(self.bundle)) / self.norm
         found = self.assumed.share * physics * (fitted * known).sum(axis=0)
         if np.isfinite(self.assumed.length_m):
             found = found + matern(machine, self.xy, self.assumed.length_m) @ known
@@ -67,9 +68,6 @@ class ResponseFit:
     def error(self) -> Array:
         """(K, K) covariance of what is wrong with the map for a press that it was not made of, noise included."""
         return covariance(self.left)
-
-    def _fields(self) -> Array:
-        return sensitivities(self.bundle, BLUR)
 
 
 def fit(
@@ -120,15 +118,13 @@ def _drawn(left: Array, share: float) -> Array:
     return np.asarray((1 - share) * found + share * np.diag(own))
 
 
-def fit_amplitudes(
-    presses: Presses, similarity: Similarity, bundle: Bundle, rounds: int = 2
-) -> tuple[ResponseFit, Presses]:
+def fit_amplitudes(presses: Presses, similarity: Similarity, bundle: Bundle) -> tuple[ResponseFit, Presses]:
     """The map, and the presses with strengths of their own: each as strong as the map that was made without it says.
 
     Skins are not even and probes do not press twice alike, whatever depth the file states.
     """
     found = fit(presses, similarity, bundle)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         live = presses.measured
         expected, d = (presses.difference - found.left)[:, live], presses.difference[:, live]
         weighted = np.linalg.solve(found.error[np.ix_(live, live)], expected.T).T

@@ -123,7 +123,7 @@ def force(
         "of": found.reads,
         "tip_m": found.tip_m,
         "most_n": found.most_n,
-        **found.said,
+        **found.origin,
     }
     report |= {"curve": found.curve.to_dict(), "unknown": unknown(found, configured)}
     emit(report) if as_json else _say(report)
@@ -163,8 +163,6 @@ def _from_csv(csv: Path, measurements: Path | None, skin: Skin, bundle: Bundle) 
 
 def _prompted(name: str, bundle: Bundle, read: TouchReader) -> list[Press]:
     """Presses on the live service, one prompt each."""
-    import time
-
     from protocol.sockets import AllReader
     from services.calibration.force_fit import CalibrationError, Press
     from services.calibration.force_presses import wait_for_press, wait_for_release
@@ -193,10 +191,10 @@ def _prompted(name: str, bundle: Bundle, read: TouchReader) -> list[Press]:
             continue
         reader = AllReader(["image"], name)  # a new one each time: nothing of before the prompt is in it
         try:
-            seen = wait_for_press(reader, read, time.monotonic)
+            seen = wait_for_press(reader, read)
             print(f"  {newton:g} N at ({seen.x * 1e3:+.1f}, {seen.y * 1e3:+.1f}) mm: release", file=sys.stderr)
             presses.append(Press(newton, seen, f"press {len(presses) + 1}", tip))
-            wait_for_release(reader, time.monotonic)
+            wait_for_release(reader)
         except CalibrationError as why:
             print(f"  {why}; this press does not count", file=sys.stderr)
         finally:

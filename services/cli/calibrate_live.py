@@ -51,7 +51,7 @@ def _enough(presses: list[Press], any_tip: bool) -> bool:
     except CalibrationError as why:
         _tell(f"  no law yet: {why}")
         return False
-    error, left = law.said["error"], missing(presses, law)
+    error, left = law.origin["error"], missing(presses, law)
     known = f"the law is known to {100 * error['law']:.1f} %, one press to {100 * error['left_out_rms']:.0f} %"
     _tell(f"  {known}; " + (f"missing: {left}" if left else "enough"))
     return not left

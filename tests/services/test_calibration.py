@@ -54,10 +54,10 @@ def test_the_law_of_a_skin_is_found_and_its_error_foretold():
     found = fit(presses(25))
     assert found.reads == "peak" and found.curve.correction != "none"
     fresh = off(found, presses(300, seed=1))
-    assert fresh < 0.05 and found.said["error"]["left_out_rms"] == pytest.approx(fresh, rel=0.6)
+    assert fresh < 0.05 and found.origin["error"]["left_out_rms"] == pytest.approx(fresh, rel=0.6)
     assert fit(presses(6, scatter=0.1)).curve.correction in ("none", "radius"), "few presses: few parameters"
     some = presses(13, seed=3, scatter=0.2)  # with as many as they allow, the fit is better than the forecast
-    assert (many := fit(some)).said["error"]["left_out_rms"] > off(many, some)
+    assert (many := fit(some)).origin["error"]["left_out_rms"] > off(many, some)
     for x, y in ((0.0, 0.0), (0.05, -0.05), (0.5, 0.5)):
         assert (np.diff([many.curve(p, x, y) for p in np.linspace(0.01, 1.5, 60)]) > 0).all(), "more is more force"
 
@@ -164,12 +164,12 @@ def of_foam(radius_mm, newton, stiffness, tip=True):
 
 def test_presses_of_two_tips_choose_pressure_and_one_says_what_it_cannot_know(skin):
     forces = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
-    differ = fit([of_foam(mm, f, of) for mm, of in ((7.0, 1.03), (14.0, 0.97)) for f in forces]).said["error"]
+    differ = fit([of_foam(mm, f, of) for mm, of in ((7.0, 1.03), (14.0, 0.97)) for f in forces]).origin["error"]
     assert differ["scatter"] < 0.01 < 0.02 < differ["law"] < 0.04, "tips differ, however many presses there are"
     two = fit([of_foam(mm, f, 1.4) for mm in (7.0, 14.0) for f in forces])
-    assert two.said["error"]["law"] < 0.02
+    assert two.origin["error"]["law"] < 0.02
     assert two.reads == "pressure" and two.curve.scale == pytest.approx(1.4, rel=0.08)
-    assert two.said["tips_m"] == pytest.approx([0.007, 0.014]) and unknown(two, skin) == ""
+    assert two.origin["tips_m"] == pytest.approx([0.007, 0.014]) and unknown(two, skin) == ""
     one = fit([of_foam(10.0, f, 1.4) for f in forces])
     assert "one tip, radius 10 mm" in unknown(one, skin) and "press with two tips" in unknown(one, skin)
     assert "nobody said what pressed" in unknown(fit([of_foam(10.0, f, 1.4, False) for f in forces]), skin)

@@ -40,7 +40,7 @@ class Calibration:
     most_n: float = MOST_N
     own_error: float = 0.0  # relative: scatter of the presses beyond what their own uncertainties explain
     tip_m: float | None = None  # radius of the one tip that presses tell; None: sizes are told by the touches
-    said: dict[str, Any] = field(default_factory=dict)  # where it comes from: see the module's text
+    origin: dict[str, Any] = field(default_factory=dict)  # where it comes from: see the module's text
 
 
 def save(path: Path, found: Calibration, name: str, skin: Skin, bundle: Bundle) -> str:
@@ -60,7 +60,7 @@ def save(path: Path, found: Calibration, name: str, skin: Skin, bundle: Bundle) 
         "curve": found.curve.to_dict(),
         "most_n": found.most_n,
         "own_error": found.own_error,
-        **found.said,
+        **found.origin,
     }
     text = json.dumps({**content, "sha256": _digest(content)}, indent=1, allow_nan=False) + "\n"
     write_whole(path, text)
@@ -89,7 +89,7 @@ def load(path: Path, skin: Skin, bundle: Bundle, name: str = "") -> Calibration:
         tip_m = None if found["tip_m"] is None else float(found["tip_m"])
         if tip_m is not None and not 0 < tip_m < math.inf:
             raise ValueError(f"tip_m {tip_m}")
-        return Calibration(Curve.from_dict(found["curve"]), found["of"], *numbers, tip_m, said=content)
+        return Calibration(Curve.from_dict(found["curve"]), found["of"], *numbers, tip_m, origin=content)
     except FileError as why:
         raise ConfigError(f"{why}: correct `calibration` in skin.toml") from None
     except (ValueError, KeyError, TypeError, RecursionError) as why:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from models.bundle import Bundle
-from models.pressure import FOAM, Foam, disc
+from models.pressure import FOAM, disc
 from protocol.frames import EstimatedTouch, ImageFrame
 from services.contacts.force import calibration_file as calibration
 from services.contacts.force import of_disc
@@ -73,7 +73,6 @@ class ForceLaw:
     calibrated: bool = False  # of this very skin, not of its kind
     indenter_m2: float | None = None  # area of what presses, where it is known
     own_error: float = 0.0  # relative: scatter of the calibration's presses beyond what their uncertainties explain
-    foam: Foam = FOAM
 
     @classmethod
     def of(cls, skin: Skin, bundle: Bundle, name: str = "") -> ForceLaw:
@@ -125,7 +124,7 @@ class ForceLaw:
             "calibrated": self.calibrated,
             "known_indenter": self.known,
         }
-        return {**described, "foam": self.foam.to_dict()} if self.reads == "pressure" else described
+        return {**described, "foam": FOAM.to_dict()} if self.reads == "pressure" else described
 
     def __str__(self) -> str:
         """For a person: `8.5 N per S/m, to 5 N`."""
@@ -151,7 +150,7 @@ class ForceLaw:
         """Whether under this pressure [Pa] the foam tells no more: what presses so hard may press harder."""
         if self.curve is None or self.reads != "pressure" or pressure is None:
             return False
-        return pressure >= self.curve.scale * float(self.foam.pressure(SATURATED))
+        return pressure >= self.curve.scale * float(FOAM.pressure(SATURATED))
 
     def quantity(self, look: Look) -> Quantity:
         """What the curve takes, of an image's touch with a peak above 0; as sure as the image is of that peak."""
@@ -165,8 +164,8 @@ class ForceLaw:
             return Quantity(drop, relative)
         drop = min(drop, MEASURABLE)
         area = look.integral / drop if self.indenter_m2 is None else self.indenter_m2
-        pressure = float(self.foam.pressure(drop))
-        spread = None if relative is None else relative * float(self.foam.gain(drop))
+        pressure = float(FOAM.pressure(drop))
+        spread = None if relative is None else relative * float(FOAM.gain(drop))
         return Quantity(pressure * area, spread, pressure, None if spread is None else pressure * spread)
 
     def of_touch(self, touch: EstimatedTouch, classes: Sequence[float] = ()) -> Force:
@@ -178,7 +177,7 @@ class ForceLaw:
     def _of_estimate(self, touch: EstimatedTouch, classes: Sequence[float]) -> Quantity:
         area = self.indenter_m2
         if self.reads == "pressure":
-            return of_disc.force_of(touch, self.foam, area, classes)
+            return of_disc.force_of(touch, area, classes)
         relative = touch.strength_sigma / touch.strength
         if self.reads == "integral":
             return Quantity(touch.strength * (1 - min(touch.drop, 1.0) / 2), relative)

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from models.pressure import Foam
+from models.pressure import FOAM
 from protocol.frames import SHAPES, EstimatedTouch
 from services.contacts.force.curve import Quantity
 
@@ -59,11 +59,11 @@ class Discs(NamedTuple):
     drop: Array
 
 
-def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None, classes: Sequence[float] = ()) -> Quantity:
-    """Force [N]: the foam's pressure at a patch's drop over its area, a mean over the radii and actions that the fit
-    leaves, and over PATCHES and EDGES. A patch that may have saturated has a force from below only: its sigma reaches
-    to where the foam tells nothing more. area [m^2]: of what presses, where it is known. classes: probabilities of
-    SHAPES by an image; empty: none tells.
+def force_of(touch: EstimatedTouch, area: float | None, classes: Sequence[float]) -> Quantity:
+    """Force [N]: the shipped foam's pressure at a patch's drop over its area, a mean over the radii and actions that
+    the fit leaves, and over PATCHES and EDGES. A patch that may have saturated has a force from below only: its sigma
+    reaches to where the foam tells nothing more. area [m^2]: of what presses, where it is known. classes:
+    probabilities of SHAPES by an image; empty: none tells.
     """
     if area is not None:
         each = _of_area(touch.strength, touch.strength_sigma, area)
@@ -71,8 +71,8 @@ def force_of(touch: EstimatedTouch, foam: Foam, area: float | None = None, class
         each = _of_any_patch(touch, classes)
     weight = each.weight / each.weight.sum()
     drop = np.minimum(each.drop, FULL)
-    pressure = foam.pressure(drop)
-    beyond = (float(foam.pressure(FULL)) - pressure) * (drop > BLIND)
+    pressure = FOAM.pressure(drop)
+    beyond = (float(FOAM.pressure(FULL)) - pressure) * (drop > BLIND)
     creeps = CREEPS * (1 - math.exp(-max(touch.age_s, 0.0) / CREEPS_S))
     force, sigma = _moments(each.area * pressure, weight, each.area * beyond, creeps)
     return Quantity(force, sigma / force, *_moments(pressure, weight, beyond, creeps))
@@ -108,12 +108,12 @@ def _of_any_patch(touch: EstimatedTouch, classes: Sequence[float]) -> Discs:
     return each
 
 
-def pressure_under(strength: float, sigma: float, area: float, foam: Foam) -> float:
+def pressure_under(strength: float, sigma: float, area: float) -> float:
     """Pressure summed over an indenter of this area [m^2] [N], as `force_of` has it; strength and sigma: of how it
     acts, drop times m^2.
     """
     each = _of_area(strength, sigma, area)
-    return float(each.weight @ (each.area * foam.pressure(each.drop)))
+    return float(each.weight @ (each.area * FOAM.pressure(each.drop)))
 
 
 def _seen_as(touch: EstimatedTouch, patch: PatchKind) -> Discs:
