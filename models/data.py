@@ -30,7 +30,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from models import command, geometry
 from models.condensed import CondensedSheet
 from models.forward import ForwardModel
-from models.mismatch import anisotropy_root, smooth_field, soft_drop, soft_touched, turned
+from models.mismatch import SmoothField, anisotropy_root, soft_drop, soft_touched, turned
 from models.npz import read_npz
 from models.scenes import TRAINING, random_scene
 from models.shapes import Shape, drop_image, from_rows, to_rows
@@ -109,7 +109,7 @@ def make_chunk(spec: ChunkSpec) -> dict[str, NDArray[Any]]:
         model = ForwardModel(skin.moved(shift), skin.pattern, mesh=spec.mesh)
     contact = skin.contact_impedance * (1 + wide * CONTACT_SPREAD * rng.uniform(-1, 1, n))
     background = 1 + wide * BACKGROUND_SPREAD * rng.uniform(-1, 1)
-    field = smooth_field(skin, wide * FIELD_LEFT * rng.uniform(), int(rng.integers(2**31)))(model.centroids)
+    field = SmoothField(skin, wide * FIELD_LEFT * rng.uniform(), int(rng.integers(2**31)))(model.centroids)
     root = anisotropy_root(wide * ANISOTROPY_LEFT * rng.uniform(), rng.uniform(0, np.pi))
 
     def sheet(scene: list[Shape], blur: float) -> NDArray[np.float64]:

@@ -111,10 +111,10 @@ def remarks(skin: SkinGeometry, said: dict[str, Any]) -> list[str]:
 
 def main(argv: list[str] | None = None) -> int:
     name, request, out = sys.argv[1:] if argv is None else argv
-    _step_back()
+    _be_nice()
     try:
-        asked = read_npz(request)
-        packed = calibrate(Bundle.load(name), asked["z0"], asked["sigma"], str(asked["baseline_hash"]))
+        arrays = read_npz(request)
+        packed = calibrate(Bundle.load(name), arrays["z0"], arrays["sigma"], str(arrays["baseline_hash"]))
     except (EitskinError, KeyError, ValueError) as why:
         print(why, file=sys.stderr)
         return 1
@@ -122,7 +122,7 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def _step_back() -> None:
+def _be_nice() -> None:
     """Whoever started this may have a real-time priority and processors of its own: both are handed down, neither is
     meant for a fit.
     """

@@ -94,7 +94,7 @@ class MismatchedSheet:
         self.skin = mounted(self.nominal, mismatch)
         self.model = ForwardModel(self.skin, mesh=mesh)
         self.root: Array = anisotropy_root(mismatch.anisotropy, mismatch.angle)
-        self.field: Array = 1 + smooth_field(self.nominal, mismatch.field, mismatch.seed)(self.model.centroids)
+        self.field: Array = 1 + SmoothField(self.nominal, mismatch.field, mismatch.seed)(self.model.centroids)
 
     def solve(
         self, shapes: Sequence[Shape] = (), background: float = 1.0, contact: float | Array | None = None
@@ -162,25 +162,20 @@ class SmoothField:
     Its mean over the skin is 0 and its root mean square `sd`, exactly, whatever the seed.
     """
 
-    def __init__(self, inside: Array, sd: float, seed: int) -> None:
-        """inside (m, 2): points that stand for the skin."""
+    def __init__(self, skin: geometry.SkinGeometry, sd: float, seed: int) -> None:
         rng = np.random.default_rng([seed, 3])
         self._waves: Array = rng.standard_normal((2, WAVES)) / FIELD_LENGTH
         self._phases: Array = rng.uniform(0, 2 * np.pi, WAVES)
         self._mean, self._scale = 0.0, 1.0
-        plain = self(inside)
+        axis = np.linspace(-1, 1, 61)
+        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        plain = self(grid[skin.inside(grid)])
         self._mean, self._scale = float(plain.mean()), sd / max(float(plain.std()), 1e-12)
 
     def __call__(self, points: Array) -> Array:
         """(...,) at points (..., 2)."""
         plain = np.cos(points @ self._waves + self._phases).sum(axis=-1)
         return np.asarray((plain - self._mean) * self._scale)
-
-
-def smooth_field(skin: geometry.SkinGeometry, sd: float, seed: int) -> SmoothField:
-    axis = np.linspace(-1, 1, 61)
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    return SmoothField(grid[skin.inside(grid)], sd, seed)
 
 
 def anisotropy_root(anisotropy: float, angle: float) -> Array:

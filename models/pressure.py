@@ -69,22 +69,14 @@ class Foam:
         """Drop [S/m] of a flat contact of this area [m^2] under a force [N]."""
         return float(self.drop(force / area))
 
-    def ball_drop(self, force: float, area: float) -> float:
-        """Drop in the middle of a Hertz contact of this area: the pressure there is 3/2 of the mean."""
-        return float(self.drop(1.5 * force / area))
-
     def peak_drop(self, kind: str, force: float, area: float) -> float:
-        """Of a contact of one of shapes.KINDS."""
-        return self.ball_drop(force, area) if kind == "hertz" else self.flat_drop(force, area)
+        """Of a contact of one of shapes.KINDS; in the middle of a Hertz contact pressure is 3/2 of the mean."""
+        return self.flat_drop(1.5 * force if kind == "hertz" else force, area)
 
     def force(self, kind: str, drop: float, area: float) -> float:
         """Force [N] of a contact of one of shapes.KINDS, of this peak drop [S/m] and area [m^2]."""
         mean = 2 / 3 if kind == "hertz" else 1.0
         return mean * area * float(self.pressure(drop))
-
-    def of_map(self, drop: ArrayLike, pixel_area: float) -> float:
-        """Force [N] of a map of drops: the law itself."""
-        return float(self.pressure(drop).sum()) * pixel_area
 
     def ball(self, drop: float, depth: ArrayLike) -> Array:
         """Drop, over that of the middle, where a Hertz contact's pressure is `depth` of the middle's (0 to 1)."""

@@ -28,7 +28,9 @@ from services.runtime.config import Skin
 from services.runtime.stage import Health, Refused, Stage, inherited, invalidate
 from services.symmetry import SymmetryMean
 
-TELLS = 0.6  # share of held-out touches whose class a registered skin's network must get right for it to be stated
+LEAST_ACCURACY = (
+    0.6  # share of held-out touches whose class a registered skin's network must get right for it to be stated
+)
 SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
 
@@ -264,7 +266,7 @@ def tells_shapes(bundle: Bundle) -> bool:
     if bundle.locator is None:
         return True
     full = (bundle.manifest.get("network") or {}).get("full") or {}
-    return float(full.get("held_out", {}).get("noise-free", {}).get("class", 0.0)) >= TELLS
+    return float(full.get("held_out", {}).get("noise-free", {}).get("class", 0.0)) >= LEAST_ACCURACY
 
 
 def _touch(found: Located, quantity: str) -> LocatedTouch:

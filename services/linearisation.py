@@ -15,7 +15,7 @@ import numpy as np
 from models.bundle import Bundle
 from models.calibration_file import CalibrationFileError
 from services.estimation.initialisation.baseline import Baseline
-from services.mounting import MountedSkin, MountingFit, keep, kept, needs_fit
+from services.mounting import MountedSkin, MountingFit, needs_fit, save, saved
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ class Linearisation:
     def __init__(self, skin: str, file: Bundle) -> None:
         self.skin, self.file = skin, file
         self.mounted: MountedSkin | None = None
-        self._fit = MountingFit(file, keep_as=skin)
+        self._fit = MountingFit(file, save_as=skin)
         self._back = False  # to the bundle as it is, as soon as nothing touches
         self._ready: MountedSkin | None = None
         self._missing = ("", 0)
@@ -78,7 +78,7 @@ class Linearisation:
         if touched or not (self._back or self._ready):
             return False
         if self._back:
-            keep(self.skin, None)
+            save(self.skin, None)
         self._use(self._ready)
         self._back, self._ready = False, None
         return True
@@ -97,17 +97,17 @@ class Linearisation:
         self._missing = (name, times)
         if times > UNKNOWN and times % SELDOM:
             return None
-        found = _adopted.get(name) or kept(self.skin, self.file)
+        found = _adopted.get(name) or saved(self.skin, self.file)
         if found is None or found.bundle.hash != name:
             return None
         self._missing = ("", 0)
         self._use(found)
         return True
 
-    def restore(self, saved: dict[str, Any]) -> bool:
+    def restore(self, state: dict[str, Any]) -> bool:
         """At a start, beside a baseline that was saved with a calibration: whether that is in use again."""
-        found = kept(self.skin, self.file)
-        if found is None or not isinstance(saved, dict) or saved.get("bundle") != found.bundle.hash:
+        found = saved(self.skin, self.file)
+        if found is None or not isinstance(state, dict) or state.get("bundle") != found.bundle.hash:
             return False
         self._use(found)
         return True

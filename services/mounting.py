@@ -75,9 +75,9 @@ def missing_package() -> str:
 class MountingFit:
     """One fit at a time, in a process of its own. `poll` never waits."""
 
-    def __init__(self, bundle: Bundle, keep_as: str = "") -> None:
-        """bundle: as it was loaded, not calibrated. keep_as: the skin under whose name what is found is kept."""
-        self.bundle, self._keep_as = bundle, keep_as
+    def __init__(self, bundle: Bundle, save_as: str = "") -> None:
+        """bundle: as it was loaded, not calibrated. save_as: the skin under whose name what is found is kept."""
+        self.bundle, self._save_as = bundle, save_as
         self.problem = ""  # why the last fit gave nothing, for a person
         self._process: subprocess.Popen[bytes] | None = None
         self._reader: Thread | None = None  # of what the process found
@@ -149,9 +149,9 @@ class MountingFit:
                 lines = (folder / "output").read_text(errors="replace").strip().splitlines()
                 raise CalibrationFileError(lines[-1] if lines else f"the fit ended with exit code {code}")
             found = MountedSkin(read_bytes(folder / "out", MOST_BYTES), self.bundle)
-            if self._keep_as:
-                keep(self._keep_as, found)
-                read = kept(self._keep_as, self.bundle)
+            if self._save_as:
+                save(self._save_as, found)
+                read = saved(self._save_as, self.bundle)
                 if read is None or read.bundle.hash != found.bundle.hash:  # inference could not follow
                     raise CalibrationFileError("what was found could not be kept in the runtime folder: is it full?")
             found.tables = skin_tables(found.bundle)
@@ -162,14 +162,14 @@ class MountingFit:
             made.cleanup()
 
 
-def keep(skin: str, found: MountedSkin | None) -> None:
+def save(skin: str, found: MountedSkin | None) -> None:
     """Keep a calibration for the next start; None: that there is none."""
     packed = np.frombuffer(found.packed if found is not None else b"", np.uint8)
     persistence.save(KEPT_AS, skin, {"packed": packed})
 
 
-def kept(skin: str, bundle: Bundle) -> MountedSkin | None:
-    """What `keep` kept, where it is this bundle's."""
+def saved(skin: str, bundle: Bundle) -> MountedSkin | None:
+    """What `save` saved, where it is this bundle's."""
     found = persistence.restore(KEPT_AS, skin)
     if found is None:
         return None

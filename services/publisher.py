@@ -45,7 +45,7 @@ BEYOND = 1.2  # times half the longer side of a skin, beyond which nothing touch
 MOST_M = 10.0  # of a sheet, and of a sigma of a place on it
 MOST_STRENGTH = MOST_M**2
 UNWATCHED_NS = 1_000_000_000  # without a frame: what began meanwhile may have been there for long
-SAYS_NOTHING = {"out_of_distribution", "non_finite"}  # reasons with which a frame shows no contact, not even an end
+SHOWS_NOTHING = {"out_of_distribution", "non_finite"}  # reasons with which a frame shows no contact, not even an end
 
 
 class Publishing(Stage):
@@ -77,7 +77,7 @@ class Publishing(Stage):
         self.lasting = LastingStates()
         self.each_alone = False  # offline: frames that do not follow each other
         self._ids: dict[int, tuple[int, int]] = {}  # of preprocessing's touch: our number, and when it was born [ns]
-        self._untold: list[Contact] = []
+        self._unsent: list[Contact] = []  # touches whose end no frame has had
         self._shown: list[Contact] = []
         self.reset()
 
@@ -93,18 +93,18 @@ class Publishing(Stage):
         self.wake()
 
     def wake(self) -> None:
-        """Nobody is left who was told of what touched."""
-        self._shown, self._untold = [], []
+        """Nobody is left who saw what touched."""
+        self._shown, self._unsent = [], []
         self._forget()
 
     def _forget(self) -> None:
         self._appearances.forget()
         self.lasting.forget()
         self._image_of = ("", -1)  # session and scan of the image that appearances were seen in
-        self._looks: dict[int, Appearance] = {}  # of the contacts that are there, by their numbers
+        self._appearance_of: dict[int, Appearance] = {}  # of the contacts that are there, by their numbers
         self._drops: dict[int, float] = {}  # S/m, at least
         self._anchors: dict[int, EstimatedTouch] = {}  # of contacts of an image, as the measurements tell them
-        self._watched = False  # whether the frame before told what touched
+        self._watched = False  # whether the frame before could show what touched
         self._watched_ns: tuple[int, int] | None = None  # `sample` of the first and last frame of those that came
 
     @property
@@ -113,7 +113,7 @@ class Publishing(Stage):
 
     def _end_all(self) -> None:
         """What was shown ends with the next frame."""
-        self._untold += self._present
+        self._unsent += self._present
         self._shown, self._ids = [], {}
 
     def process(self, frame: Frame, wanted: frozenset[str]) -> list[Frame]:
@@ -126,11 +126,11 @@ class Publishing(Stage):
         if not all(_readable(touch, self._reach_m) for touch in frame.estimates):
             invalidate(out, "non_finite")
         elif isinstance(frame, ImageFrame):
-            self._look(frame, out)
+            self._see(frame, out)
         self._watch(now_ns)
-        if out.valid or not SAYS_NOTHING & set(out.reasons):
+        if out.valid or not SHOWS_NOTHING & set(out.reasons):
             out.contacts = self._contacts(frame, out)
-            self._note(out)
+            self._judge(out)
         else:
             self._watched = False
             self._counters["unknown"] += 1
@@ -149,13 +149,13 @@ class Publishing(Stage):
         return frames
 
     def _watch(self, now_ns: int) -> None:
-        """Since when somebody has looked."""
+        """Since when frames have come without a pause."""
         first_ns, last_ns = self._watched_ns or (now_ns, now_ns)
         if not 0 <= now_ns - last_ns < UNWATCHED_NS:
             first_ns = now_ns
         self._watched_ns = first_ns, now_ns
 
-    def _look(self, frame: ImageFrame, out: ContactFrame) -> None:
+    def _see(self, frame: ImageFrame, out: ContactFrame) -> None:
         """Take what the image shows."""
         out.held = frame.held
         self.lacks = not self.held.complete(frame)
@@ -185,44 +185,40 @@ class Publishing(Stage):
         if pictured and out.valid and not found:
             invalidate(out, "out_of_distribution")
         here = {contact.id for contact in found}
-        gone = [c for c in (*self._untold, *before.values()) if c.id not in here]
+        gone = [c for c in (*self._unsent, *before.values()) if c.id not in here]
         self._watched = out.valid
         if not out.valid:
             return found
         if pictured and isinstance(frame, ImageFrame):
             self._image_of = frame.session, frame.reconstructed
         self._counters["contacts"] += sum(contact.id not in before for contact in found)
-        ended = self._writer.gone(gone)
-        self._untold, self._shown = [], [*found, *ended]
+        self._unsent, self._shown = [], [*found, *self._writer.gone(gone)]
         self._ids = {touch: known for touch, known in self._ids.items() if known[0] in here}
         return list(self._shown)
 
-    def _measured(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact], alone: bool) -> list[Contact]:
-        """As the measurements tell them. alone: what touches in this frame began with it."""
-        now_ns = frame.stamps.get("sample", 0)
-        self._looks, self._drops = {}, {}
-        found = [self._contact(touch, now_ns, before, alone) for touch in frame.estimates]
-        return sorted(found, key=lambda contact: -(contact.force_n or 0.0))
-
     def _found(self, frame: ImageFrame | PartFrame, before: Mapping[int, Contact], alone: bool) -> list[Contact]:
-        """As the measurements tell them, or as the image shows them, or as they were where it is the one of before."""
+        """As the measurements tell them, or as the image shows them, or as they were where it is the one of before.
+        alone: what touches in this frame began with it.
+        """
         if self._image_touches is None:
-            return self._measured(frame, before, alone)
+            self._appearance_of, self._drops = {}, {}
+            found = [self._contact(touch, frame, before, alone) for touch in frame.estimates]
+            return sorted(found, key=lambda contact: -(contact.force_n or 0.0))
         if isinstance(frame, ImageFrame) and not frame.touched:
             return []
         if isinstance(frame, PartFrame) or (frame.session, frame.reconstructed) == self._image_of:
             return self._moved(frame, before)
-        known_looks = {number: self._looks[number] for number in before}  # they stay where this frame is not valid
-        touches = self._image_touches.found(frame, known_looks)
-        numbers = self._image_touches.same(touches, known_looks)
-        self._looks, self._anchors = known_looks, {}
-        found = list[Contact]()
-        for touch, known in zip(touches, numbers, strict=True):
-            number = known or self._next_id
+        known = {number: self._appearance_of[number] for number in before}  # they stay where this frame is not valid
+        touches = self._image_touches.found(frame, known)
+        numbers = self._image_touches.same(touches, known)
+        self._appearance_of, self._anchors = known, {}
+        found = []
+        for touch, same in zip(touches, numbers, strict=True):
+            number = same or self._next_id
             self._next_id = max(self._next_id, number + 1)
-            state = "hold" if known or not (self._watched or alone) else "begin"
-            self._looks[number], self._drops[number] = touch.looks, touch.segment.peak
-            if (moves := self._image_touches.estimated(touch.looks, frame.estimates)) is not None:
+            state = "hold" if same or not (self._watched or alone) else "begin"
+            self._appearance_of[number], self._drops[number] = touch.appearance, touch.segment.peak
+            if (moves := self._image_touches.estimated(touch.appearance, frame.estimates)) is not None:
                 self._anchors[number] = moves
             found.append(self._writer.of_image(number, state, touch, frame, moves))
         return found
@@ -242,15 +238,14 @@ class Publishing(Stage):
                 found.append(held)
             elif isinstance(frame, ImageFrame):
                 found.append(held)  # something touches, and nothing else is known
-        now_ns = frame.stamps.get("sample", 0)
-        for touch in frame.estimates if isinstance(frame, PartFrame) else []:
-            if touch.id not in followed:
-                found.append(self._contact(touch, now_ns, before, alone=False))
-                self._anchors[found[-1].id] = touch
+        begun = [touch for touch in frame.estimates if touch.id not in followed] if isinstance(frame, PartFrame) else []
+        for touch in begun:
+            found.append(self._contact(touch, frame, before, alone=False))
+            self._anchors[found[-1].id] = touch
         return found
 
-    def _contact(self, touch: EstimatedTouch, now_ns: int, before: Mapping[int, Contact], alone: bool) -> Contact:
-        born_ns = now_ns - round(1e9 * touch.age_s)
+    def _contact(self, touch: EstimatedTouch, frame: Frame, before: Mapping[int, Contact], alone: bool) -> Contact:
+        born_ns = frame.stamps.get("sample", 0) - round(1e9 * touch.age_s)
         number, then_ns = self._ids.get(touch.id, (0, 0))
         if not number or abs(born_ns - then_ns) > SAME_BIRTH_NS:  # a preprocessing that began anew counts from 1
             number = self._next_id
@@ -258,20 +253,19 @@ class Publishing(Stage):
         self._ids[touch.id] = number, born_ns
         watched = self._watched_ns is not None and born_ns > self._watched_ns[0]
         state = "begin" if (touch.began and watched or alone) and number not in before else "hold"
-        looks = self._looks[number] = self._appearances.of(touch)
+        appearance = self._appearance_of[number] = self._appearances.of(touch)
         self._drops[number] = touch.drop - 3 * touch.drop_sigma
-        return self._writer.of_estimate(number, state, touch, looks)
+        return self._writer.of_estimate(number, state, touch, appearance)
 
-    def _note(self, out: ContactFrame) -> None:
+    def _judge(self, out: ContactFrame) -> None:
         """What to know of these contacts."""
         if any((c.force_n or 0.0) > self.law.most_n or self.law.saturates(c.pressure_pa) for c in out.contacts):
             add_reason(out.reasons, "extrapolated")
         sigmas = [c.position_sigma[0] for c in out.contacts if c.position_sigma is not None]
         if any(sigma > self._coarse_m for sigma in sigmas):
             add_reason(out.reasons, "coarse")
-        for contact in out.contacts:
-            if contact.id in self._drops and self.law.impossible(self._drops[contact.id], contact.force_n):
-                invalidate(out, "out_of_distribution")
+        if any(c.id in self._drops and self.law.impossible(self._drops[c.id], c.force_n) for c in out.contacts):
+            invalidate(out, "out_of_distribution")
 
     def _force(self, frame: ContactFrame) -> ForceFrame:
         """The total force; valid if the contacts are."""
@@ -284,13 +278,13 @@ class Publishing(Stage):
 
     def _shape(self, out: ContactFrame) -> ShapeFrame:
         present = [c for c in out.contacts if c.state != "end"]
-        looks = [self._looks[c.id] for c in present]
+        appearances = [self._appearance_of[c.id] for c in present]
         return ShapeFrame(
             **inherited(out),
             ids=[c.id for c in present],
-            outlines=[look.outline for look in looks],
+            outlines=[each.outline for each in appearances],
             orientation=[c.orientation for c in present],
-            probabilities=[look.classes or [0.0] * len(SHAPES) for look in looks],
+            probabilities=[each.classes or [0.0] * len(SHAPES) for each in appearances],
         )
 
     def state(self) -> dict[str, Any]:
@@ -298,11 +292,11 @@ class Publishing(Stage):
             "next_id": self._next_id,
             "ids": [[touch, *known] for touch, known in self._ids.items()],
             "shown": [asdict(c) for c in self._shown],
-            "untold": [asdict(c) for c in self._untold],
+            "untold": [asdict(c) for c in self._unsent],
             "watched_ns": list(self._watched_ns or ()),
             "lasting": self.lasting.state(),
-            "looks": [[touch, asdict(look)] for touch, look in self._appearances.known.items()],
-            "seen": [[number, self._drops[number], asdict(look)] for number, look in self._looks.items()],
+            "looks": [[touch, asdict(each)] for touch, each in self._appearances.known.items()],
+            "seen": [[number, self._drops[number], asdict(each)] for number, each in self._appearance_of.items()],
             "image_of": list(self._image_of),
             "anchors": [[number, asdict(touch)] for number, touch in self._anchors.items()],
         }
@@ -313,20 +307,20 @@ class Publishing(Stage):
             self._end_all()
             return
         if _given(state) == _given(self.state()):  # its own
-            more, self._untold = 0, []
+            more, self._unsent = 0, []
         else:
             more = self._next_id - 1  # numbers of another life: none is given twice
             self._end_all()
         self._next_id = more + int(state["next_id"])
         self._ids = {int(touch): (more + int(number), int(born_ns)) for touch, number, born_ns in state["ids"]}
         self._shown = [_restored(c, more) for c in state["shown"]]
-        self._untold += [_restored(c, more) for c in state["untold"]]
+        self._unsent += [_restored(c, more) for c in state["untold"]]
         watched = [int(each) for each in state["watched_ns"]]
         self._watched_ns = (watched[0], watched[1]) if watched else None
         self.lasting.load(state["lasting"])
-        self._appearances.known = {int(touch): Appearance(**look) for touch, look in state["looks"]}
+        self._appearances.known = {int(touch): Appearance(**each) for touch, each in state["looks"]}
         seen = state.get("seen", [])
-        self._looks = {more + int(number): Appearance(**look) for number, _, look in seen}
+        self._appearance_of = {more + int(number): Appearance(**each) for number, _, each in seen}
         self._drops = {more + int(number): float(drop) for number, drop, _ in seen}
         self._anchors = {more + int(number): EstimatedTouch(**touch) for number, touch in state.get("anchors", [])}
         session, scan = state.get("image_of", ("", -1))

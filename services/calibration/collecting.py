@@ -93,9 +93,9 @@ class Collector:
         """The next image frame and the scan that it comes from."""
         frame = self._reader.recv(0.5)
         if isinstance(frame, RawFrame) and frame.kind == "full":
-            _keep(self._raw, frame.scan, np.abs(frame.z).astype(float))
+            _remember(self._raw, frame.scan, np.abs(frame.z).astype(float))
         elif isinstance(frame, ImageFrame):
-            _keep(self._images, frame.scan, frame)
+            _remember(self._images, frame.scan, frame)
         if frame is None or not (frame.scan in self._raw and frame.scan in self._images):
             return None
         return self._images.pop(frame.scan), self._raw.pop(frame.scan)
@@ -109,7 +109,7 @@ def _disturbance(image: ImageFrame) -> str:
     return "" if image.valid else f"the frames are not valid{reasons}"
 
 
-def _keep(of: dict[int, Any], scan: int, value: Any) -> None:
+def _remember(of: dict[int, Any], scan: int, value: Any) -> None:
     of[scan] = value
     while len(of) > 2 * UNTOUCHED:  # the other one never came
         del of[next(iter(of))]

@@ -31,7 +31,7 @@ DIRECTIONS = (12, 24, 48)  # of the whitened differences that the kernel machine
 REACHES = (2.0, 4.0, 8.0)  # weight of the place beside them: features per presses' radius, half
 LOUDNESS = (1.0, 3.0, 10.0)
 BETTER = 0.92  # of the error: what is left out is found by less than all presses, so a small gain is none
-TELLS = 0.8  # of the spread: depths or forces that are not told better than that are not told at all
+MOST_ERROR = 0.8  # of the spread: depths or forces that are not told better than that are not told at all
 MOST_FOR_SECOND = 100  # presses from which the thresholds of further touches are found
 SINGLE = 0.99  # share of single presses that are to count as one touch
 MARGIN = 1.3  # on that threshold
@@ -99,7 +99,9 @@ def build(presses: Presses, similarity: Similarity, bundle: Bundle) -> tuple[Loc
     )
     error = None
     if presses.value is not None and np.ptp(presses.value) > 0:
-        found, error = _tells(presses.value, presses.quantity, near, amplitude, found, np.sqrt(rotation.shape[1]))
+        found, error = _value_machine(
+            presses.value, presses.quantity, near, amplitude, found, np.sqrt(rotation.shape[1])
+        )
     distance = np.linalg.norm(left, axis=1)
     before = float(np.median(np.linalg.norm(places - stage, axis=1)))
     return found, whole, Crossed(distance, inside, error, corrected, before)
@@ -270,7 +272,7 @@ def _squares(left: Array, covariance: Array) -> Array:
     return np.asarray(np.einsum("ni,nij,nj->n", left, np.linalg.inv(covariance), left))
 
 
-def _tells(
+def _value_machine(
     value: Array, quantity: str, near: Array, amplitude: Array, found: LocatorArrays, size: float
 ) -> tuple[LocatorArrays, Array | None]:
     """`found` with what says how deep [m] or hard [N] a press is, and what it is off by (N,) for presses that were left
@@ -284,7 +286,7 @@ def _tells(
     each = [(search(np.hstack([near, w * loud]), value[:, None], offset, size), w) for w in LOUDNESS]
     machine, weight = min(each, key=lambda pair: pair[0].error)
     spread = float(value.std())
-    if machine.error > TELLS * spread:
+    if machine.error > MOST_ERROR * spread:
         return found, None
     centres = np.hstack([near, weight * loud])
     machine_arrays = named("press", machine, centres, np.array([spread]))

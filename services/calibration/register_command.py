@@ -19,7 +19,7 @@ from services.recordings.reconstruction import find_skin
 
 
 def register_presses(
-    arrays: Mapping[str, NDArray[Any]], skin: str, count: int | None, out: Path, told: KnownPose | None = None
+    arrays: Mapping[str, NDArray[Any]], skin: str, count: int | None, out: Path, known: KnownPose | None = None
 ) -> dict[str, Any]:
     """Fits the first `count` presses (None: all), writes the bundle folder `out` and a skin.toml in it; returns the
     report.
@@ -33,9 +33,9 @@ def register_presses(
             raise RegistrationError(f"--presses {count}: the file holds {held}, at least {FEWEST} are needed")
         arrays = part(arrays, slice(0, count))
     presses = read_presses(arrays, bundle)
-    found = register(presses, bundle, told)
+    found = register(presses, bundle, known)
     locator, response, crossed = build(presses, found.similarity, bundle)
-    report = said(presses, found, len(bundle.pattern))
+    report = summary(presses, found, len(bundle.pattern))
     report |= {"left_out": crossed.report(presses.quantity)}
     report |= {"correlation_length_m": response.assumed.length_m}
     made = write_corrected(out, presses, response, locator, report)
@@ -43,7 +43,7 @@ def register_presses(
     return {**report, "bundle": str(out)}
 
 
-def said(presses: Presses, found: Registration, measurements: int) -> dict[str, Any]:
+def summary(presses: Presses, found: Registration, measurements: int) -> dict[str, Any]:
     """What is known of the presses and the pose."""
     similarity = found.similarity
     return {

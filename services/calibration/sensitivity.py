@@ -24,9 +24,8 @@ from services.calibration.response import ResponseFit
 Array = NDArray[np.float64]
 
 MODEL_ERROR = 1.0  # lambda: the model error's share beside the mean eigenvalue of the whitened Gram matrix
-TYPICAL_DROP = (
-    0.3  # S/m that a mean press is shown as: a skin that nobody calibrated in newtons has no scale of its own
-)
+TYPICAL_DROP = 0.3
+"""S/m that a mean press is shown as: a skin that nobody calibrated in newtons has no scale of its own."""
 
 
 def corrected(presses: Presses, found: ResponseFit, bundle: Bundle) -> Matrices:
@@ -59,11 +58,7 @@ def _typical_peak(presses: Presses, matrices: Matrices) -> float:
 
 
 def write_corrected(
-    folder: Path,
-    presses: Presses,
-    found: ResponseFit,
-    locator: LocatorArrays | None,
-    notes: dict[str, Any],
+    folder: Path, presses: Presses, found: ResponseFit, locator: LocatorArrays | None, notes: dict[str, Any]
 ) -> Bundle:
     """A bundle folder of this very skin, in its true metres. `notes` goes into the manifest as `registration`."""
     bundle = found.bundle

@@ -150,13 +150,13 @@ def register_frame(
 
     if numbering not in (None, "clockwise", "counter-clockwise"):
         fail(f"found --numbering {numbering}, expected clockwise or counter-clockwise", USAGE)
-    told = KnownPose(
+    known = KnownPose(
         diameter,
         None if first_electrode is None else math.radians(first_electrode),
         None if numbering is None else numbering == "clockwise",
     )
     out = out or Path("calibration", Path(skin).name)
-    report = register_presses(load_npz(source), skin, presses, out, told)
+    report = register_presses(load_npz(source), skin, presses, out, known)
     if as_json:
         emit(report)
         return

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from protocol.frames import SHAPES, Contact, EstimatedTouch, ImageFrame
-from services.contacts.force.law import Force, ForceLaw, Look
+from services.contacts.force.law import Force, ForceLaw, ImagePatch
 from services.contacts.images.of_image import ImageTouch
-from services.contacts.images.segmentation import Segment
-from services.contacts.reading import Appearance
+from services.contacts.reading import Appearance, Pixels
 from services.contacts.surface import Placement
 
 
@@ -23,9 +22,10 @@ class ContactWriter:
     def __init__(self, law: ForceLaw, place: Placement, tells_force: bool) -> None:
         self.law, self.place, self.tells_force = law, place, tells_force
 
-    def of_estimate(self, number: int, state: str, touch: EstimatedTouch, look: Appearance) -> Contact:
-        """A touch as the measurements tell it, and as it looks."""
-        contact = self._here(number, state, look, self.law.of_touch(touch, look.classes), touch.velocity)
+    def of_estimate(self, number: int, state: str, touch: EstimatedTouch, appearance: Appearance) -> Contact:
+        """A touch as the measurements tell it, and as an image shows it."""
+        force = self.law.of_touch(touch, appearance.classes)
+        contact = self._here(number, state, appearance, force, touch.velocity)
         contact.confidence = 0.5 * (1 + math.erf(math.sqrt(touch.z2 / 2)))
         contact.position_sigma = list(touch.sigma)
         return contact
@@ -34,32 +34,35 @@ class ContactWriter:
         self, number: int, state: str, touch: ImageTouch, frame: ImageFrame, moves: EstimatedTouch | None
     ) -> Contact:
         """A touch as an image shows it, or as a registered skin's map tells it; moves: as the measurements tell it."""
-        looks, located = touch.looks, touch.located
-        found = self.law.force(Look.of(touch.segment, frame))
+        appearance, located, s = touch.appearance, touch.located, touch.segment
+        pixels = Pixels(frame.metres_per_pixel, frame.origin)
+        integral = s.volume * pixels.side_m * pixels.side_m
+        found = self.law.force(ImagePatch(s.peak, s.peak_sigma, integral, *pixels.place(s.x, s.y)))
         if located is not None and not self.law.exists:
             found = Force(located.force_n, None if located.force_n is None else located.value_sigma)
-        contact = self._here(number, state, looks, found, (0.0, 0.0) if moves is None else moves.velocity)
-        contact.confidence = confidence(touch.segment)
+        contact = self._here(number, state, appearance, found, (0.0, 0.0) if moves is None else moves.velocity)
+        # probability that the peak is not noise, from its own standard deviation
+        contact.confidence = 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))
         if located is not None:
             contact.position_sigma, contact.indentation_m = list(located.sigma), located.indentation_m
             contact.indentation_sigma_m = None if located.indentation_m is None else located.value_sigma
         return contact
 
-    def _here(self, number: int, state: str, looks: Appearance, force: Force, velocity: Sequence[float]) -> Contact:
+    def _here(self, number: int, state: str, shown: Appearance, force: Force, velocity: Sequence[float]) -> Contact:
         """What all contacts that are there have."""
-        best = int(np.argmax(looks.classes)) if looks.classes else -1
+        best = int(np.argmax(shown.classes)) if shown.classes else -1
         return Contact(
             id=number,
             state=state,
-            orientation=looks.orientation,
-            area_m2=looks.area_m2,
+            orientation=shown.orientation,
+            area_m2=shown.area_m2,
             force_n=force.newton,
             force_sigma_n=force.sigma,
             pressure_pa=force.pressure,
             pressure_sigma_pa=force.pressure_sigma,
-            shape=SHAPES[best] if looks.classes else "unknown",
-            shape_probability=looks.classes[best] if looks.classes else None,
-            **self._placed(looks.x, looks.y, velocity, force.newton or 0.0),
+            shape=SHAPES[best] if shown.classes else "unknown",
+            shape_probability=shown.classes[best] if shown.classes else None,
+            **self._placed(shown.x, shown.y, velocity, force.newton or 0.0),
         )
 
     def moved(self, contact: Contact, before: EstimatedTouch, now: EstimatedTouch) -> Contact:
@@ -91,8 +94,3 @@ class ContactWriter:
             )
             for c in contacts
         ]
-
-
-def confidence(s: Segment) -> float:
-    """Probability that the peak is not noise, from its own standard deviation."""
-    return 1.0 if s.peak_sigma <= 0 else 0.5 * (1 + math.erf(s.peak / s.peak_sigma / math.sqrt(2)))

@@ -13,7 +13,7 @@ from models.shapes import Shape
 from models.solved_presses import SolvedPresses, solve
 from protocol.frames import Contact
 from services.contacts.force.curve import Curve
-from services.contacts.force.law import ForceLaw, Look
+from services.contacts.force.law import ForceLaw, ImagePatch
 from services.contacts.force.of_disc import SATURATED
 from services.estimation.initialisation.baseline import take
 from services.pipeline import Pipeline
@@ -122,8 +122,8 @@ def test_the_force_of_a_press_is_told_whatever_its_size(bundle: Bundle) -> None:
 # the law
 
 
-def look(**more: float) -> Look:
-    return Look(**{"peak": 0.3, "peak_sigma": 0.03, "integral": 1e-4, "x": 0.0, "y": 0.0, **more})
+def look(**more: float) -> ImagePatch:
+    return ImagePatch(**{"peak": 0.3, "peak_sigma": 0.03, "integral": 1e-4, "x": 0.0, "y": 0.0, **more})
 
 
 def of_images(**more: object) -> ForceLaw:

@@ -51,7 +51,7 @@ class Bench:
 
     def mounted(self, packed, bundle, z0):
         """Start with a baseline that was kept beside this calibration."""
-        mounting.keep("palm", mounting.MountedSkin(packed, bundle))
+        mounting.save("palm", mounting.MountedSkin(packed, bundle))
         kept = Baseline(z0, NOISE * z0, 64, "b", 1)
         saved = {"bundle": unpack(packed, bundle).hash, "baseline": kept.to_dict(), "taken_s": 0.0}
         self.pipeline.pre.restore(saved, 1.0)
@@ -80,7 +80,7 @@ def test_frames_name_their_calibration_and_inference_follows_although_it_comes_l
     delta.calibration = own.hash
     (image,) = bench.pipeline.inference.process(delta, frozenset({"image"}))
     assert delta.valid and not image.valid and "stale_baseline" in image.reasons, "it is nowhere to be found"
-    mounting.keep("palm", mounting.MountedSkin(packed, bundle))
+    mounting.save("palm", mounting.MountedSkin(packed, bundle))
     late = [bench.pipeline.inference.process(delta, frozenset({"image"}))[0].valid for _ in range(25)]
     assert any(late) and late[-1], "within a second of frames"
     # a start that finds a baseline that was kept with it goes on with it, unless skin.toml says no
@@ -138,7 +138,7 @@ def test_a_tare_by_command_calibrates_while_nothing_touches(sheet, bundle):
     assert bench.tare()["calibrating"]
     linearisation = bench.pipeline.pre.linearisation
     bench.feed(TOUCH, frames=4)
-    found = until(lambda: (bench.pipeline.prepare(), mounting.kept("palm", bundle))[1])
+    found = until(lambda: (bench.pipeline.prepare(), mounting.saved("palm", bundle))[1])
     bench.pipeline.prepare()
     assert linearisation.name == "", "something touches"
     assert bench.feed(frames=12).contact.valid

@@ -20,13 +20,12 @@ import numpy as np
 
 from models.bundle import Bundle
 from models.pressure import FOAM, disc
-from protocol.frames import EstimatedTouch, ImageFrame
+from protocol.frames import EstimatedTouch
 from services.contacts.force import calibration_file as calibration
 from services.contacts.force import of_disc
 from services.contacts.force.calibration_file import Of
 from services.contacts.force.curve import Curve, Quantity
 from services.contacts.force.of_disc import MEASURABLE, SATURATED, flat_drop
-from services.contacts.images.segmentation import Segment
 from services.runtime.config import ConfigError, Skin
 
 NEWTONS_PER_SIEMENS = 10.0  # N per S/m, of a law that reads the peak: 0.1 to 0.5 S/m are 1 to 5 N
@@ -38,19 +37,14 @@ NAMES: dict[Of, str] = {"pressure": "pressure over the patch", "peak": "peak dro
 
 
 @dataclass(frozen=True)
-class Look:
-    """What an image shows of one touch, in the skin's frame."""
+class ImagePatch:
+    """What an image shows of one touch, on the sheet."""
 
     peak: float  # S/m
     peak_sigma: float  # S/m, the network's own word; 0: it has none
     integral: float  # S/m m^2
     x: float  # m, centroid
     y: float
-
-    @classmethod
-    def of(cls, s: Segment, frame: ImageFrame) -> Look:
-        m, (x, y) = frame.metres_per_pixel, frame.origin
-        return cls(s.peak, s.peak_sigma, s.volume * m * m, x + (s.x + 0.5) * m, y + (s.y + 0.5) * m)
 
 
 class Force(NamedTuple):
@@ -152,18 +146,18 @@ class ForceLaw:
             return False
         return pressure >= self.curve.scale * float(FOAM.pressure(SATURATED))
 
-    def quantity(self, look: Look) -> Quantity:
+    def quantity(self, patch: ImagePatch) -> Quantity:
         """What the curve takes, of an image's touch with a peak above 0; as sure as the image is of that peak."""
-        relative = look.peak_sigma / look.peak if look.peak_sigma > 0 else None
+        relative = patch.peak_sigma / patch.peak if patch.peak_sigma > 0 else None
         if self.reads == "integral":
-            return Quantity(look.integral, relative)
-        drop = look.peak
+            return Quantity(patch.integral, relative)
+        drop = patch.peak
         if self.indenter_m2 is not None:
-            drop = flat_drop(look.integral / (1 - min(drop, MEASURABLE) / 2) / self.indenter_m2)
+            drop = flat_drop(patch.integral / (1 - min(drop, MEASURABLE) / 2) / self.indenter_m2)
         if self.reads == "peak":
             return Quantity(drop, relative)
         drop = min(drop, MEASURABLE)
-        area = look.integral / drop if self.indenter_m2 is None else self.indenter_m2
+        area = patch.integral / drop if self.indenter_m2 is None else self.indenter_m2
         pressure = float(FOAM.pressure(drop))
         spread = None if relative is None else relative * float(FOAM.gain(drop))
         return Quantity(pressure * area, spread, pressure, None if spread is None else pressure * spread)
@@ -184,11 +178,11 @@ class ForceLaw:
         drop = flat_drop(touch.strength / (math.pi * touch.radius_m**2 if area is None else area))
         return Quantity(drop, relative if area is not None else touch.drop_sigma / max(drop, 1e-9))
 
-    def force(self, look: Look) -> Force:
+    def force(self, patch: ImagePatch) -> Force:
         """Force and standard uncertainty of a touch as an image shows it."""
-        if self.curve is None or not (look.peak > 0 and look.integral > 0):
+        if self.curve is None or not (patch.peak > 0 and patch.integral > 0):
             return NOTHING
-        return self._force(self.quantity(look), look.x, look.y)
+        return self._force(self.quantity(patch), patch.x, patch.y)
 
     def _force(self, found: Quantity, x: float, y: float) -> Force:
         """A quantity as a force, by the curve; the pressure goes with it."""

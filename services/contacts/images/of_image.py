@@ -21,7 +21,7 @@ class ImageTouch:
     """One touch of an image."""
 
     segment: Segment  # the part of the image that is its
-    looks: Appearance  # with its place [m]
+    appearance: Appearance  # with its place [m]
     reach_m: float  # from its middle to the farthest of it
     located: LocatedTouch | None  # by the map of a registered skin
 
@@ -42,25 +42,28 @@ class ImageTouches:
             places = [(x, y) for x, y in (touch.position for touch in frame.touches)]
             parts = divided(frame.image, frame.sigma, [image.at(*place) for place in places])
         else:
-            parts = segment(frame.image, frame.sigma, [image.at(look.x, look.y) for look in before.values()])
+            parts = segment(frame.image, frame.sigma, [image.at(each.x, each.y) for each in before.values()])
             places, located = [image.place(s.x, s.y) for s in parts], [None] * len(parts)
         return [
             ImageTouch(s, image.appearance(s, frame, *place), s.reach * image.side_m, touch)
             for s, place, touch in zip(parts, places, located, strict=True)
         ]
 
-    def estimated(self, looks: Appearance, estimates: Iterable[EstimatedTouch]) -> EstimatedTouch | None:
+    def estimated(self, appearance: Appearance, estimates: Iterable[EstimatedTouch]) -> EstimatedTouch | None:
         """A registered skin's touch as the measurements tell it: the nearest that is near enough to be the same."""
-        apart = [(math.hypot(t.position[0] - looks.x, t.position[1] - looks.y), k, t) for k, t in enumerate(estimates)]
+        apart = [
+            (math.hypot(t.position[0] - appearance.x, t.position[1] - appearance.y), k, t)
+            for k, t in enumerate(estimates)
+        ]
         distance, _, nearest = min(apart, default=(math.inf, 0, None))
         return nearest if distance < self._same_m else None
 
     def same(self, touches: list[ImageTouch], before: Mapping[int, Appearance]) -> list[int]:
         """Of each touch the number that it had before, the nearest pairs first; 0: it is new."""
         apart = [
-            (math.hypot(touch.looks.x - look.x, touch.looks.y - look.y), k, number)
+            (math.hypot(touch.appearance.x - each.x, touch.appearance.y - each.y), k, number)
             for k, touch in enumerate(touches)
-            for number, look in before.items()
+            for number, each in before.items()
         ]
         found, taken = [0] * len(touches), set[int]()
         for distance, k, number in sorted(apart):
