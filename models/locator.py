@@ -76,13 +76,13 @@ class WhitenedMap:
         grid[a.allowed] = np.arange(int(a.allowed.sum()))
         few = grid.reshape(rows, columns)[::2, ::2].ravel()
         self.few = few[few >= 0]
-        self.gram = self.r[self.few] @ self.r[self.few].T
+        gram = self.r[self.few] @ self.r[self.few].T
         self.first, self.second = np.triu_indices(len(self.few), 1)
         q = self.q[self.few]
-        determinant = q[self.first] * q[self.second] - self.gram[self.first, self.second] ** 2
+        determinant = q[self.first] * q[self.second] - gram[self.first, self.second] ** 2
         apart = determinant > 0.02 * q[self.first] * q[self.second]
         self.first, self.second, self.determinant = self.first[apart], self.second[apart], determinant[apart]
-        self.between = self.gram[self.first, self.second]
+        self.between = gram[self.first, self.second]
 
 
 class Locator:

@@ -177,12 +177,7 @@ def shift_derivative(solution: Solution) -> Array:
     drive, sense = (incidence(model.pattern[:, k : k + 2], skin.n_electrodes) for k in (0, 2))
     found = np.zeros((len(model.pattern), skin.n_electrodes))
     for sign, ends in ((-1.0, skin.edges[:, 0]), (1.0, skin.edges[:, 1])):
-        node = _nearest(model, skin.point(ends))
+        node = [int(((model.mesh.p.T - point) ** 2).sum(axis=1).argmin()) for point in skin.point(ends)]
         jump = solution.potentials[node] - solution.transfer  # (E, E): at the end of l, for each unit current
         found -= sign * (drive @ jump.T) * (sense @ jump.T) / solution.contact_impedance
     return found
-
-
-def _nearest(model: ForwardModel, points: Array) -> NDArray[np.int64]:
-    """(m,) the mesh's node at each of the points, which are nodes."""
-    return np.array([int(((model.mesh.p.T - point) ** 2).sum(axis=1).argmin()) for point in points])

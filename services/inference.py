@@ -28,9 +28,7 @@ from services.runtime.config import Skin
 from services.runtime.stage import Health, Refused, Stage, inherited, invalidate
 from services.symmetry import SymmetryMean
 
-LEAST_ACCURACY = (
-    0.6  # share of held-out touches whose class a registered skin's network must get right for it to be stated
-)
+LEAST_ACCURACY = 0.6  # share of held-out touches whose class a registered skin's network gets right if it is stated
 SETTLED = 5  # after so many untouched frames with the same noise, a touch is expected to have it too
 
 

@@ -12,9 +12,9 @@ from services.runtime.stage import inherited
 MOST = 1e300  # what stands for more, and for no number: a verdict turns at both
 
 
-def judged(said: DeltaFrame, judgements: Iterable[Judgement]) -> JudgementsFrame:
-    """Why `said`, or the part frame of the same scan, says what it says; with its validity, reasons and stamps."""
-    out = JudgementsFrame(**inherited(said))
+def judged(frame: DeltaFrame, judgements: Iterable[Judgement]) -> JudgementsFrame:
+    """Why a frame, or the part frame of the same scan, is as it is; with its validity, reasons and stamps."""
+    out = JudgementsFrame(**inherited(frame))
     for each in judgements:
         out.names.append(each.name)
         out.statistics.append(_finite(each.statistic))

@@ -98,14 +98,13 @@ class Preprocessing(Stage):
     def _use(self, baseline: Baseline | None) -> None:
         self.baseline, self._tared = baseline, self.estimator.skin
         self.revision += 1
-        if baseline is not None:
-            self._reconstruction.begin(self._sigma(baseline), baseline.frames)
-
-    def _sigma(self, baseline: Baseline) -> Array:
-        """(K,) of the difference, one scan."""
+        if baseline is None:
+            return
         if baseline.taken_by == "file" and self.references.noise is not None:
-            return self.references.sigma(baseline, self.pre)
-        return np.asarray(baseline.sigma / self.pre.normaliser(baseline.z0))
+            sigma = self.references.sigma(baseline, self.pre)
+        else:
+            sigma = baseline.sigma / self.pre.normaliser(baseline.z0)
+        self._reconstruction.begin(sigma, baseline.frames)
 
     # --- one scan, or the newest values after a part of one ---
 

@@ -99,9 +99,8 @@ def build(presses: Presses, similarity: Similarity, bundle: Bundle) -> tuple[Loc
     )
     error = None
     if presses.value is not None and np.ptp(presses.value) > 0:
-        found, error = _value_machine(
-            presses.value, presses.quantity, near, amplitude, found, np.sqrt(rotation.shape[1])
-        )
+        size = np.sqrt(rotation.shape[1])
+        found, error = _value_machine(presses.value, presses.quantity, near, amplitude, found, size)
     distance = np.linalg.norm(left, axis=1)
     before = float(np.median(np.linalg.norm(places - stage, axis=1)))
     return found, whole, Crossed(distance, inside, error, corrected, before)
@@ -124,15 +123,13 @@ def _plain(presses: Presses, whole: ResponseFit, similarity: Similarity, bundle:
     allowed = _near(grid, places, margin) & _on_skin(grid, similarity, bundle)
     machine = similarity.to_machine(grid[allowed] / similarity.scale)
     k = int(presses.measured.sum())
-    error = np.where(np.outer(presses.measured, presses.measured), whole.error, 0.0)
-    error[~presses.measured, ~presses.measured] = 1.0
     return LocatorArrays(
         shape=np.array([rows, columns]),
         corner=low,
         spacing=np.array(spacing),
         allowed=allowed,
         map=np.where(presses.measured, whole.at(machine), 0.0).astype(np.float32),
-        error=error,
+        error=_with_ones(whole.error, presses.measured),
         noise=np.where(presses.measured, presses.noise, 0.0),
         measured=presses.measured,
         misfit=np.array(1.0),
@@ -206,6 +203,7 @@ def _further(now: WhitenedMap, z: Array) -> list[tuple[float, float]]:
 
 
 def _with_ones(error: Array, measured: NDArray[np.bool_]) -> Array:
+    """A covariance in which nothing but itself tells of what was not measured."""
     return np.asarray(np.where(np.outer(measured, measured), error, np.eye(len(error))))
 
 

@@ -87,10 +87,5 @@ class ContactWriter:
 
     def gone(self, contacts: Sequence[Contact]) -> list[Contact]:
         """The last contacts of touches that were shown so."""
-        force = 0.0 if self.tells_force else None
-        return [
-            Contact(
-                id=c.id, state="end", position=c.position, normal=c.normal, force_n=force, confidence=0.0, sheet=c.sheet
-            )
-            for c in contacts
-        ]
+        ended: dict[str, Any] = {"state": "end", "confidence": 0.0, "force_n": 0.0 if self.tells_force else None}
+        return [Contact(id=c.id, position=c.position, normal=c.normal, sheet=c.sheet, **ended) for c in contacts]

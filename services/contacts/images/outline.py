@@ -18,7 +18,9 @@ def outline(mask: NDArray[np.bool_], metres_per_pixel: float, origin: list[float
     corners: list[list[float]] = []
     while True:
         x, y = x + dx, y + dy
-        left, right = _ahead(padded, x, y, dx, dy)
+        # the pixels to the left and right of the edge ahead; pixel (x, y) is above right of corner (x, y)
+        left = padded[y + (dx + dy - 1) // 2, x + (dx - dy - 1) // 2]
+        right = padded[y + (dy - dx - 1) // 2, x + (dx + dy - 1) // 2]
         if not left:  # the mask ended on the left: turn left
             turn = (-dy, dx)
         elif right:  # the mask continues on the right: turn right
@@ -30,16 +32,3 @@ def outline(mask: NDArray[np.bool_], metres_per_pixel: float, origin: list[float
         dx, dy = turn
         if (x, y) == start and (dx, dy) == (1, 0):
             return corners
-
-
-def _ahead(padded: NDArray[np.bool_], x: int, y: int, dx: int, dy: int) -> tuple[bool, bool]:
-    """Whether the pixels to the left and right of the edge ahead belong to the mask; corner (x, y), pixel (x, y) is
-    above right of it.
-    """
-    if dx:
-        column = x if dx > 0 else x - 1
-        above, below = bool(padded[y, column]), bool(padded[y - 1, column])
-        return (above, below) if dx > 0 else (below, above)
-    row = y if dy > 0 else y - 1
-    east, west = bool(padded[row, x]), bool(padded[row, x - 1])
-    return (west, east) if dy > 0 else (east, west)
