@@ -98,7 +98,7 @@ def warped(bundle: Bundle) -> WarpedModel:
     skin, a, m = from_dict(bundle.skin), bundle.locator, bundle.matrices
     places = Locator(a).places / bundle.metres_per_unit
     measured = np.where(a.measured, a.map.astype(float), 0.0)  # (N, K) by a mean press at each of N places
-    at = _at(places, m.inside.shape)
+    at = [(places[:, k] + 1) * n / 2 - 0.5 for k, n in zip((1, 0), m.inside.shape, strict=True)]  # rows, columns
     pixel = 4.0 / m.inside.size
     volume = float(-np.log1p(-PRESS_DROP) * np.pi * PRESS_RADIUS**2)
     # The bundle's own sensitivities are the same map in another unit.
@@ -129,14 +129,8 @@ def warped(bundle: Bundle) -> WarpedModel:
     )
 
 
-def _at(places: Array, shape: tuple[int, ...]) -> Array:
-    """(2, N) rows and columns of the grid at (N, 2) points in model units."""
-    h, w = shape
-    return np.stack([(places[:, 1] + 1) * h / 2 - 0.5, (places[:, 0] + 1) * w / 2 - 0.5])
-
-
-def _sampled(fields: Array, inside: npt.NDArray[np.bool_], at: Array, radius: float) -> Array:
-    """(N, K) of fields (K, P), averaged over a disc of `radius` model units that stays on the skin."""
+def _sampled(fields: Array, inside: npt.NDArray[np.bool_], at: list[Array], radius: float) -> Array:
+    """(N, K) of fields (K, P) at N rows and columns, averaged over a disc of `radius` model units, on the skin."""
     h, w = inside.shape
     sigma = 0.5 * radius * w / 2  # a Gaussian of the disc's second moment along each axis
     weight = np.maximum(ndimage.gaussian_filter(inside.astype(float), sigma), 0.05)

@@ -49,8 +49,7 @@ class Pipeline:
         self.name = name
         self.delta: DeltaFrame | None = None  # the newest one; parts of scans come between two of them
         self.image: ImageFrame | None = None  # the newest one
-        self.stages = build_stages(name, skin, bundle)
-        self.pre, self.inference, self.publishing = self.stages
+        self.pre, self.inference, self.publishing = build_stages(name, skin, bundle)
         self.pre.always_reconstruct = always_reconstruct
         self.pre.each_alone = self.publishing.each_alone = each_alone
 
@@ -86,11 +85,11 @@ class Pipeline:
 
     def prepare(self) -> None:
         """Do the work that the processes do while no frame waits."""
-        for stage in self.stages:
+        for stage in (self.pre, self.inference, self.publishing):
             stage.between_frames()
             stage.prepare()
 
     def reset(self) -> None:
         """Forget baseline, touches and tracks."""
-        for stage in self.stages:
+        for stage in (self.pre, self.inference, self.publishing):
             stage.reset()

@@ -120,8 +120,11 @@ class Preprocessing(Stage):
         self._part = (frame.scan, self._part[1])
         if self.continuity.broken(frame, frame.parts):
             add_reason(out.reasons, "gap")
-        if len(frame.z) != len(self.bundle.pattern):
-            return [self._no_scan(out, frame)]
+        if len(frame.z) != len(self.bundle.pattern):  # another skin's
+            self._counters["foreign"] += 1
+            expected = f"the bundle {self.bundle.name} has {len(self.bundle.pattern)}"
+            self._foreign = f"frames of {len(frame.z)} measurements, {expected}"
+            return [self._unusable(out, "out_of_distribution")]
         self._foreign = ""
         self._follow(frame)
         if frame.kind == "reference":
@@ -206,13 +209,6 @@ class Preprocessing(Stage):
         out.sigma = sigma_of_mean(out.sigma, made.averaged)
         out.reconstructed, out.averaged = out.scan, made.averaged
         self._counters["reconstructed"] += 1
-
-    def _no_scan(self, out: DeltaFrame, frame: RawFrame) -> DeltaFrame:
-        """A frame that cannot be compared with the baseline: another skin's."""
-        self._counters["foreign"] += 1
-        found, expected = len(frame.z), len(self.bundle.pattern)
-        self._foreign = f"frames of {found} measurements, the bundle {self.bundle.name} has {expected}"
-        return self._unusable(out, "out_of_distribution")
 
     def _touches(self, estimate: Estimate) -> list[EstimatedTouch]:
         return [on_the_wire(touch, self.bundle.metres_per_unit) for touch in estimate.touches]

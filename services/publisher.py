@@ -208,9 +208,15 @@ class Publishing(Stage):
             return []
         if isinstance(frame, PartFrame) or (frame.session, frame.reconstructed) == self._image_of:
             return self._moved(frame, before)
+        return self._of_image(frame, self._image_touches, before, alone)
+
+    def _of_image(
+        self, frame: ImageFrame, image_touches: ImageTouches, before: Mapping[int, Contact], alone: bool
+    ) -> list[Contact]:
+        """What a new image shows."""
         known = {number: self._appearance_of[number] for number in before}  # they stay where this frame is not valid
-        touches = self._image_touches.found(frame, known)
-        numbers = self._image_touches.same(touches, known)
+        touches = image_touches.found(frame, known)
+        numbers = image_touches.same(touches, known)
         self._appearance_of, self._anchors = known, {}
         found = []
         for touch, same in zip(touches, numbers, strict=True):
@@ -218,7 +224,7 @@ class Publishing(Stage):
             self._next_id = max(self._next_id, number + 1)
             state = "hold" if same or not (self._watched or alone) else "begin"
             self._appearance_of[number], self._drops[number] = touch.appearance, touch.segment.peak
-            if (moves := self._image_touches.estimated(touch.appearance, frame.estimates)) is not None:
+            if (moves := image_touches.estimated(touch.appearance, frame.estimates)) is not None:
                 self._anchors[number] = moves
             found.append(self._writer.of_image(number, state, touch, frame, moves))
         return found

@@ -48,10 +48,6 @@ class Curve:
     coefficients: tuple[float, ...] = ()
     reach: float = 1.0  # m from the skin's centre along x or y up to which the correction was fitted
 
-    @property
-    def kind(self) -> str:
-        return "linear" if self.exponent == 1.0 else "power law"
-
     def __call__(self, quantity: float, x: float = 0.0, y: float = 0.0) -> float:
         if not quantity > 0:
             return 0.0

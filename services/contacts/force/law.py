@@ -111,7 +111,7 @@ class ForceLaw:
         if self.curve is None:
             return None
         described: dict[str, object] = {
-            "kind": f"{self.curve.kind} in the {NAMES[self.reads]}",
+            "kind": f"{'linear' if self.curve.exponent == 1.0 else 'power law'} in the {NAMES[self.reads]}",
             "of": self.reads,
             **self.curve.to_dict(),
             "most_n": self.most_n,
