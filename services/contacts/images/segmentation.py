@@ -70,10 +70,7 @@ def segment(image: Image, sigma: Image, expected: Sequence[Place] = ()) -> list[
     found = []
     for label in range(1, count + 1):
         own = np.where(labels == label, smooth, 0.0)
-        mask = _half(own)
-        whole = np.zeros(image.shape, dtype=bool)
-        whole[rows, columns] = mask
-        found.append(_measured(part, noise, own, mask, whole, (columns.start, rows.start), float(volumes[label])))
+        found.append(_measured(part, noise, own, image.shape, (rows.start, columns.start), float(volumes[label])))
     return sorted(found, key=lambda s: -s.peak)
 
 
@@ -92,8 +89,7 @@ def divided(image: Image, sigma: Image, places: Sequence[Place]) -> list[Segment
         if own.max() <= 0:
             column, row = (int(min(max(round(p), 0), n - 1)) for p, n in ((px, image.shape[1]), (py, image.shape[0])))
             own[row, column] = floor
-        mask = _half(own)
-        found.append(_measured(image, sigma, own, mask, mask, (0, 0), volume))
+        found.append(_measured(image, sigma, own, image.shape, (0, 0), volume))
     return found
 
 
@@ -145,24 +141,17 @@ def _labels(smooth: Image, floor: float, expected: Sequence[Place]) -> tuple[Lab
     return labels, count
 
 
-def _half(own: Image) -> NDArray[np.bool_]:
-    """The pixels above half the peak that are connected to it."""
-    top = int(own.argmax())
-    mask = own > 0.5 * own.flat[top]
-    labels, count = ndimage.label(mask, FOUR)
-    return mask if count == 1 else np.asarray(labels == labels.flat[top]) & mask
-
-
 def _measured(
-    image: Image,
-    sigma: Image,
-    own: Image,
-    mask: NDArray[np.bool_],
-    whole: NDArray[np.bool_],
-    corner: tuple[int, int],
-    volume: float,
+    image: Image, sigma: Image, own: Image, shape: tuple[int, ...], corner: tuple[int, int], volume: float
 ) -> Segment:
-    """The touch in numbers; own: its part of the smoothed image, corner: of the box in the whole image."""
+    """The touch in numbers; own: its part of the smoothed image, shape: of the whole image, corner: row and column
+    there of these.
+    """
+    top = int(own.argmax())
+    labels, _ = ndimage.label(own > 0.5 * own.flat[top], FOUR)
+    mask = labels == labels.flat[top]  # the pixels above half the peak that are connected to it
+    whole = np.zeros(shape, dtype=bool)
+    whole[corner[0] : corner[0] + mask.shape[0], corner[1] : corner[1] + mask.shape[1]] = mask
     values = image[mask]
     peak = values[values >= PLATEAU * values.max()]  # its mean is what one noisy pixel does not move
     noise = sigma[mask] if sigma.size else sigma
@@ -175,8 +164,8 @@ def _measured(
         peak=float(peak.mean()),
         peak_sigma=peak_sigma,
         volume=volume,
-        x=cx + corner[0],
-        y=cy + corner[1],
+        x=cx + corner[1],
+        y=cy + corner[0],
         area=area,
         orientation=0.5 * float(np.arctan2(2 * mxy, mxx - myy)),
         reach=float(np.sqrt(((x - cx) ** 2 + (y - cy) ** 2).max())),
