@@ -377,7 +377,7 @@ def _write(
         about = manifest.describe(target.skin.name, target.skin, matrices, network=entries or None)
         written = bundle.write(target.out, about, matrices, made, response=tables)
     else:
-        about = manifest.of_registered(target.registered, network=entries or None, warped=target.model.said)
+        about = manifest.of_registered(target.registered, network=entries or None, warped=target.model.provenance)
         written = bundle.write(target.out, about, matrices, made, target.registered.locator)
     for curve in target.work.glob("*.png") if made else ():
         shutil.copy(curve, target.out / f"training_{curve.name}")

@@ -1,6 +1,6 @@
 """A bundle calibrated to one very skin: its matrices about the skin as it is mounted, in one packed piece (numpy only).
 
-    packed = pack(matrices, skin, said)      # models/fit_calibration.py does, after the fit
+    packed = pack(matrices, skin, findings)  # models/fit_calibration.py does, after the fit
     mine = unpack(packed, bundle)            # a Bundle with those matrices, that geometry and a hash of its own
 
 The hash covers the bundle's hash and every byte of the piece. The network files stay the bundle's.
@@ -27,7 +27,7 @@ from protocol.errors import EitskinError
 
 SCHEMA = 1
 MOST_BYTES = 32 * 1024 * 1024  # unpacked
-KEY = "calibration"  # in the manifest: what the fit found, as `said`
+KEY = "calibration"  # in the manifest: what the fit found, as `findings`
 FIELDS = "fields"  # older calibrations have none
 
 
@@ -36,15 +36,15 @@ class CalibrationFileError(EitskinError):
 
 
 def pack(
-    matrices: Matrices, skin: Mapping[str, Any], said: Mapping[str, Any], fields: NDArray[np.float32] | None = None
+    matrices: Matrices, skin: Mapping[str, Any], findings: Mapping[str, Any], fields: NDArray[np.float32] | None = None
 ) -> bytes:
-    """skin: the geometry as mounted (`SkinGeometry.to_dict`); said: what the fit found, with `bundle_hash`; fields: as
-    `Bundle.mounted_fields`.
+    """skin: the geometry as mounted (`SkinGeometry.to_dict`); findings: what the fit found, with `bundle_hash`;
+    fields: as `Bundle.mounted_fields`.
     """
     arrays: dict[str, Any] = {f.name: np.asarray(getattr(matrices, f.name)) for f in dataclasses.fields(Matrices)}
     lower = np.tril_indices(len(matrices.gram))  # it is symmetric: a state with the whole would be too large to send
     arrays["gram"] = np.asarray(matrices.gram)[lower]
-    text = json.dumps({"schema": SCHEMA, "skin": dict(skin), **said}, allow_nan=False)
+    text = json.dumps({"schema": SCHEMA, "skin": dict(skin), **findings}, allow_nan=False)
     if fields is not None:
         arrays[FIELDS] = fields.astype(np.float16)  # as response.npz has them
     out = io.BytesIO()
@@ -56,8 +56,8 @@ def unpack(packed: bytes, bundle: Bundle) -> Bundle:
     """The bundle (as it was loaded, not calibrated before) with this calibration. Raises CalibrationFileError."""
     try:
         arrays: dict[str, Any] = dict(npz(io.BytesIO(packed), "the calibration", MOST_BYTES))
-        said = json.loads(arrays.pop("said").tobytes())
-        schema, made_for, skin = said.pop("schema"), said["bundle_hash"], dict(said.pop("skin"))
+        findings = json.loads(arrays.pop("said").tobytes())
+        schema, made_for, skin = findings.pop("schema"), findings["bundle_hash"], dict(findings.pop("skin"))
         arrays["gram"] = _whole(arrays["gram"], len(arrays["z0"]))
         fields = _fields(arrays.pop(FIELDS), arrays["contact"].shape[1]) if FIELDS in arrays else None
         matrices = matrices_of(arrays)
@@ -69,7 +69,7 @@ def unpack(packed: bytes, bundle: Bundle) -> Bundle:
         raise CalibrationFileError(
             f"a calibration of the bundle {str(made_for)[:12]}, this is {bundle.hash[:12]}: run `skin tare` again"
         )
-    manifest = {**bundle.manifest, "skin": skin, KEY: said}
+    manifest = {**bundle.manifest, "skin": skin, KEY: findings}
     try:
         check(manifest, matrices)
     except Wrong as why:
@@ -97,5 +97,5 @@ def _fields(values: NDArray[Any], electrodes: int) -> NDArray[np.float32]:
 
 def found_by(bundle: Bundle) -> dict[str, Any] | None:
     """What the calibration of a calibrated bundle found; None for any other."""
-    said = bundle.manifest.get(KEY)
-    return dict(said) if isinstance(said, dict) else None
+    findings = bundle.manifest.get(KEY)
+    return dict(findings) if isinstance(findings, dict) else None

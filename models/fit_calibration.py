@@ -53,8 +53,8 @@ def calibrate(bundle: Bundle, z0: Array, sigma: Array, baseline_hash: str = "") 
         raise TooFewMeasured(f"the bundle {bundle.name} has no geometry to calibrate ({why})") from None
     found = fit(skin, bundle.matrices, z0, sigma)
     matrices = calibrated(bundle.matrices, skin, found.mounting)
-    said = {"bundle_hash": bundle.hash, "baseline_hash": baseline_hash, **describe(skin, found)}
-    return pack(matrices, found.mounting.skin(skin).to_dict(), said, fields_as_mounted(skin, found.mounting))
+    report = {"bundle_hash": bundle.hash, "baseline_hash": baseline_hash, **describe(skin, found)}
+    return pack(matrices, found.mounting.skin(skin).to_dict(), report, fields_as_mounted(skin, found.mounting))
 
 
 def describe(skin: SkinGeometry, found: CalibrationFit) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def describe(skin: SkinGeometry, found: CalibrationFit) -> dict[str, Any]:
     inside = skin.inside(points)
     field = np.exp(FieldModes(skin)(points) @ mounting.field)
     size = float(np.hypot(*mounting.anisotropy))
-    said = {
+    report = {
         "contact_times": np.exp(mounting.contact).round(4).tolist(),
         "contact_sd": sd.contact.round(4).tolist(),
         "shift_m": (mounting.shift * skin.metres_per_unit).round(7).tolist(),
@@ -78,32 +78,34 @@ def describe(skin: SkinGeometry, found: CalibrationFit) -> dict[str, Any]:
         "misfit_before": found.before,
         "misfit": found.after,
     }
-    return {**said, "remarks": remarks(skin, said)}
+    return {**report, "remarks": remarks(skin, report)}
 
 
-def remarks(skin: SkinGeometry, said: dict[str, Any]) -> list[str]:
+def remarks(skin: SkinGeometry, report: dict[str, Any]) -> list[str]:
     """What looks wrong with the mounting, one sentence each."""
     found = []
     side = float(np.ptp(skin.polygon(), axis=0).max()) * skin.metres_per_unit
-    for e, (times, sd) in enumerate(zip(said["contact_times"], said["contact_sd"], strict=True)):
+    for e, (times, sd) in enumerate(zip(report["contact_times"], report["contact_sd"], strict=True)):
         if abs(np.log(times)) > max(np.log(WORTH_CONTACT), SURE * sd):
             todo = "press it on, clean or moisten it" if times > 1 else "look for moisture or a short beside it"
             found.append(f"electrode {e}: contact impedance {times:.2g} times the file's: {todo}")
-    for e, (shift, sd) in enumerate(zip(said["shift_m"], said["shift_sd_m"], strict=True)):
+    for e, (shift, sd) in enumerate(zip(report["shift_m"], report["shift_sd_m"], strict=True)):
         if abs(shift) > max(WORTH_SHIFT * side, SURE * sd):
             way = "further along" if shift > 0 else "back along"
             found.append(f"electrode {e}: {1e3 * abs(shift):.1f} mm {way} the outline than the file says")
-    if said["field_rms"] > WORTH_FIELD:
-        found.append(f"the sheet conducts unevenly ({100 * said['field_rms']:.0f} % rms): thickness, moisture or wear")
-    if said["anisotropy"] > max(WORTH_ANISOTROPY, SURE * said["anisotropy_sd"]):
-        angle = np.degrees(said["anisotropy_rad"]) % 180
+    if report["field_rms"] > WORTH_FIELD:
         found.append(
-            f"the sheet conducts {100 * said['anisotropy']:.0f} % better along {angle:.0f} degrees, as much worse "
+            f"the sheet conducts unevenly ({100 * report['field_rms']:.0f} % rms): thickness, moisture or wear"
+        )
+    if report["anisotropy"] > max(WORTH_ANISOTROPY, SURE * report["anisotropy_sd"]):
+        angle = np.degrees(report["anisotropy_rad"]) % 180
+        found.append(
+            f"the sheet conducts {100 * report['anisotropy']:.0f} % better along {angle:.0f} degrees, as much worse "
             "across: stretched when it was mounted?"
         )
-    if said["misfit"] > WORTH_MISFIT:
+    if report["misfit"] > WORTH_MISFIT:
         found.append(
-            f"{100 * said['misfit']:.1f} % of the untouched impedances stay unexplained: shifts of several percent, "
+            f"{100 * report['misfit']:.1f} % of the untouched impedances stay unexplained: shifts of several percent, "
             "exchanged wires, damage, or something touched the skin"
         )
     return found

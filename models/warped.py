@@ -43,7 +43,7 @@ class WarpedModel:
     gain: Array  # (K,)
     correction: Array  # (K, P) J' - G J
     own: OwnSkin
-    said: dict[str, Any]  # for the manifest
+    provenance: dict[str, Any]  # for the manifest
 
     def differences(self, simulated: Array, drop: Array) -> Array:
         """(N, K) of a simulated difference and its drop (N, 96, 96)."""
@@ -120,7 +120,7 @@ def warped(bundle: Bundle) -> WarpedModel:
         gain=gain,
         correction=(sensitivity - gain[:, None] * simulated) * m.inside.ravel(),
         own=OwnSkin(vectors * np.sqrt(np.maximum(values, 0.0)), np.where(a.measured, a.noise, 0.0)),
-        said={
+        provenance={
             "press_radius_m": PRESS_RADIUS * bundle.metres_per_unit,
             "press_drop": PRESS_DROP,
             "simulation_explains": round(1 - float(left), 4),

@@ -68,8 +68,15 @@ def describe(
     }
     if baseline is not None:
         found |= {"baseline": baseline.z0, "baseline_sigma": baseline.sigma, "baseline_hash": baseline.hash}
-        found["baseline_revision"] = revision
-        found |= {"tare_sample_ns": baseline.taken_ns, "tare": provenance(baseline, bundle)}
+        found |= {"baseline_revision": revision, "tare_sample_ns": baseline.taken_ns}
+        found["tare"] = {
+            "taken_by": baseline.taken_by,
+            "restored": baseline.restored,
+            "frames": baseline.frames,
+            "board": baseline.board,
+            "bundle_hash": bundle.hash,
+            "doubt": baseline.doubt,
+        }
     return found
 
 
@@ -149,18 +156,6 @@ class BaselineNews:
                 return False
         self._sent = _Announced(baseline, origin, now_ns)
         return True
-
-
-def provenance(baseline: Baseline, bundle: Bundle) -> dict[str, Any]:
-    """Where the baseline comes from."""
-    return {
-        "taken_by": baseline.taken_by,
-        "restored": baseline.restored,
-        "frames": baseline.frames,
-        "board": baseline.board,
-        "bundle_hash": bundle.hash,
-        "doubt": baseline.doubt,
-    }
 
 
 def geometry(bundle: Bundle) -> dict[str, Any]:

@@ -268,11 +268,8 @@ def tells_shapes(bundle: Bundle) -> bool:
 
 
 def _touch(found: Located, quantity: str) -> LocatedTouch:
-    made = LocatedTouch(position=[found.x, found.y], sigma=found.sigma, amplitude=found.amplitude)
-    if found.value is not None:
-        setattr(made, quantity, found.value)
-        made.value_sigma = found.value_sigma
-    return made
+    value = {} if found.value is None else {quantity: found.value, "value_sigma": found.value_sigma}
+    return LocatedTouch(position=[found.x, found.y], sigma=found.sigma, amplitude=found.amplitude, **value)
 
 
 def _rms(sigma: NDArray[np.float32]) -> float | None:

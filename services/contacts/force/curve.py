@@ -51,10 +51,7 @@ class Curve:
     def __call__(self, quantity: float, x: float = 0.0, y: float = 0.0) -> float:
         if not quantity > 0:
             return 0.0
-        names = TERMS[self.correction]
-        if not names:
-            return float(self.scale * quantity**self.exponent)
-        log = columns(names, np.array([x]), np.array([y]), self.reach) @ np.array(self.coefficients)
+        log = columns(TERMS[self.correction], np.array([x]), np.array([y]), self.reach) @ np.array(self.coefficients)
         return float(self.scale * quantity**self.exponent * math.exp(float(log[0])))
 
     def to_dict(self) -> dict[str, Any]:

@@ -101,11 +101,6 @@ class ForceLaw:
     def exists(self) -> bool:
         return self.curve is not None
 
-    @property
-    def known(self) -> bool:
-        """Whether the size of what presses is known, and used."""
-        return self.indenter_m2 is not None and self.reads != "integral"
-
     def describe(self) -> dict[str, object] | None:
         """For info/<skin>."""
         if self.curve is None:
@@ -116,7 +111,7 @@ class ForceLaw:
             **self.curve.to_dict(),
             "most_n": self.most_n,
             "calibrated": self.calibrated,
-            "known_indenter": self.known,
+            "known_indenter": self.indenter_m2 is not None and self.reads != "integral",
         }
         return {**described, "foam": FOAM.to_dict()} if self.reads == "pressure" else described
 
