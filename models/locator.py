@@ -92,8 +92,7 @@ class Locator:
         self.a = arrays
         iy, ix = np.divmod(np.flatnonzero(arrays.allowed), int(arrays.shape[1]))
         self.places = arrays.corner + float(arrays.spacing) * np.stack([ix, iy], axis=1)
-        self._conditioned: WhitenedMap | None = None
-        self._key = b""
+        self._conditioned: dict[bytes, WhitenedMap] = {}  # the one of the newest noise
         self._trained = WhitenedMap(arrays, np.asarray(arrays.measured), np.zeros(len(arrays.noise)))
         self._place, self._press = arrays.machine("place"), arrays.machine("press")
         self.quantity = QUANTITIES[int(arrays.quantity)]
@@ -107,9 +106,9 @@ class Locator:
         if (live == self.a.measured).all() and not extra.any():
             return self._trained
         key = live.tobytes() + extra.tobytes()
-        if self._conditioned is None or key != self._key:
-            self._conditioned, self._key = WhitenedMap(self.a, live, extra), key
-        return self._conditioned
+        if key not in self._conditioned:
+            self._conditioned = {key: WhitenedMap(self.a, live, extra)}
+        return self._conditioned[key]
 
     def locate(self, difference: Array, sigma: Array) -> list[Located]:
         """The touches that explain a difference (K,), strongest first; [] where none does."""

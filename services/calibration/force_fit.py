@@ -191,14 +191,10 @@ def _table(presses: Sequence[Press], of_one_tip: bool) -> Table:
     quantity = {of: np.log([p.seen.quantities[of].value for p in presses]) for of in KINDS}
     x, y = np.array([(p.seen.x, p.seen.y) for p in presses]).T
     reach = max(float(np.max(np.abs([x, y]))), 1e-6)
-    of_tip = {radius: _under(radius, presses) for radius in TIPS_M} if of_one_tip else {}
+    acts = [(s.value, s.value * (s.relative or 0.0)) for s in (p.seen.strength for p in presses)]
+    radii = TIPS_M if of_one_tip else ()
+    of_tip = {radius: np.log([pressure_under(*each, disc(radius)) for each in acts]) for radius in radii}
     return Table(np.log([p.force_n for p in presses]), quantity, of_tip, x, y, reach)
-
-
-def _under(radius_m: float, presses: Sequence[Press]) -> Array:
-    """(N,) log of the pressure over a tip."""
-    each = [p.seen.strength for p in presses]
-    return np.log([pressure_under(s.value, s.value * (s.relative or 0.0), disc(radius_m)) for s in each])
 
 
 def _forms(n: int, kinds: Sequence[Of], tip_m: float | None) -> list[Form]:

@@ -101,17 +101,15 @@ class _Pose:
         self.radius = radius_of(xy)
         at = electrodes(bundle)
         self.circle = float(np.linalg.norm(at, axis=1).max())
-        first = float(np.arctan2(at[0, 1], at[0, 0]))
+        self.first = float(np.arctan2(at[0, 1], at[0, 0]))
         turning = at[:, 0] * np.roll(at[:, 1], -1) - at[:, 1] * np.roll(at[:, 0], -1)
-        self.bundle_clockwise = bool(turning.sum() < 0)
-        self.first = first
+        bundle_clockwise = bool(turning.sum() < 0)
         if known.diameter_m is None:
             self.sizes = (SIZE[0] * self.radius / self.circle, SIZE[1] * self.radius / self.circle)
         else:
             size = 0.5 * known.diameter_m / self.circle
             self.sizes = (size * (1 - KNOWN_SIZE), size * (1 + KNOWN_SIZE))
-        both = (False, True)
-        self.ways = both if known.clockwise is None else (known.clockwise != self.bundle_clockwise,)
+        self.ways = (False, True) if known.clockwise is None else (known.clockwise != bundle_clockwise,)
         self.known_angle = known.first_electrode
 
     def angles(self, mirrored: bool) -> Array:
