@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from services.contacts.images.splitting import FOUR, Image, Labels, Place, cut, moments, peaks_of, territories
+from services.contacts.images.splitting import FOUR, Image, Labels, Place, cut, peaks_of, territories
 
 FLOOR = 0.02  # S/m: a weaker peak is no touch (0.2 N by the published law)
 RELATIVE_FLOOR = 0.12  # of the strongest peak: weaker ones are side lobes of it
@@ -158,7 +158,10 @@ def _measured(
     peak_sigma = float(noise.mean()) if noise.size and np.isfinite(noise).all() else 0.0
     y, x = np.nonzero(ndimage.binary_dilation(mask, FOUR))
     weight = np.clip(2 * own[y, x] / own.max() - 0.5, 0, 1)  # pixels on the edge count in part
-    area, cx, cy, mxx, myy, mxy = moments(weight, x, y)
+    area = float(weight.sum())
+    cx, cy = float(weight @ x) / area, float(weight @ y) / area
+    dx, dy = x - cx, y - cy
+    mxx, myy, mxy = (float(weight @ v) / area for v in (dx * dx, dy * dy, dx * dy))
     return Segment(
         mask=whole,
         peak=float(peak.mean()),
@@ -168,5 +171,5 @@ def _measured(
         y=cy + corner[0],
         area=area,
         orientation=0.5 * float(np.arctan2(2 * mxy, mxx - myy)),
-        reach=float(np.sqrt(((x - cx) ** 2 + (y - cy) ** 2).max())),
+        reach=float(np.sqrt((dx * dx + dy * dy).max())),
     )

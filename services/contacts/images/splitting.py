@@ -112,8 +112,10 @@ def cut(own: Image, expected: Sequence[Place]) -> NDArray[np.bool_] | None:
     top = float(own.max())
     y, x = np.nonzero(own > 0.5 * top)
     weight = own[y, x]
-    total, cx, cy, mxx, myy, mxy = moments(weight, x, y)
+    total = float(weight.sum())
+    cx, cy = float(weight @ x) / total, float(weight @ y) / total
     dx, dy = x - cx, y - cy
+    mxx, myy, mxy = (float(weight @ v) / total for v in (dx * dx, dy * dy, dx * dy))
     spread = math.hypot(mxx - myy, 2 * mxy)  # of the squared lengths of the two axes
     if mxx + myy + spread < LONG**2 * (mxx + myy - spread):
         return None
@@ -138,15 +140,6 @@ def cut(own: Image, expected: Sequence[Place]) -> NDArray[np.bool_] | None:
     rows, columns = np.indices(own.shape)
     beyond = c * (columns - cx) + s * (rows - cy) - start >= waist
     return np.asarray((beyond if share > 0.5 else ~beyond) & (own > 0))
-
-
-def moments(weight: Image, x: NDArray[np.intp], y: NDArray[np.intp]) -> tuple[float, float, float, float, float, float]:
-    """Sum of weights, their centroid x and y, and the second moments xx, yy and xy about it."""
-    total = float(weight.sum())
-    cx, cy = float(weight @ x) / total, float(weight @ y) / total
-    dx, dy = x - cx, y - cy
-    mxx, myy, mxy = (float(weight @ v) / total for v in (dx * dx, dy * dy, dx * dy))
-    return total, cx, cy, mxx, myy, mxy
 
 
 def _profile(along: Image, weight: Image) -> Image:
