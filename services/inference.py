@@ -200,8 +200,12 @@ class Inference(Stage):
         out.reconstructed = frame.scan
         self._last, self._unseen, self._surer = out, None, None
         self._made_of, self._stack_sent, self._again = frame, False, False
-        if self._symmetry is not None and frame.touched and stack is not None and np.isfinite(frame.sigma).all():
+        if self._symmetry is None:
+            return
+        if frame.touched and stack is not None and np.isfinite(frame.sigma).all():
             self._symmetry.begin(stack, (out.image, out.sigma, out.classes))
+        else:
+            self._symmetry.forget()  # else the mean of the image before would come as this one's
 
     def _hold(self, frame: DeltaFrame, out: ImageFrame) -> None:
         """Hold the image of the frame last reconstructed, if this process has it. It is sent again only for new

@@ -218,6 +218,7 @@ class Publishing(Stage):
         touches = image_touches.found(frame, known)
         numbers = image_touches.same(touches, known)
         self._appearance_of, self._anchors = known, {}
+        self._drops = {number: self._drops[number] for number in known}
         found = []
         for touch, same in zip(touches, numbers, strict=True):
             number = same or self._next_id
