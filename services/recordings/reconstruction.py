@@ -20,6 +20,7 @@ from services.estimation.initialisation.baseline import (
     Baseline,
     NoBaseline,
     coarseness,
+    identical,
     implausible,
     take,
 )
@@ -90,12 +91,15 @@ def baseline_of(
     found = _mean_of(frames, pre, warn)
     if off := implausible(found.z0, found.sigma / found.frames**0.5, pre, UNLIKE):
         doubt = f"`untouched` is {off}: {SEE} (--skin, --pattern)"
-    elif steps := coarseness(frames if rows is None else rows):
-        doubt = f"|Z| is known {steps}: measure it with 10 bits or more"
-    else:
+    elif not (doubt := _too_coarse(frames, frames[:0] if rows is None else rows)):
         return found
     warn(doubt)
     return replace(found, doubt=doubt)
+
+
+def _too_coarse(untouched: Array, rows: NDArray[Any]) -> str:
+    steps = coarseness(np.vstack([untouched, np.abs(rows)]))
+    return steps and f"|Z| is known {steps}: measure it with 10 bits or more"
 
 
 def _mean_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None]) -> Baseline:
@@ -105,7 +109,7 @@ def _mean_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None]) 
         frames = frames[:1]
     if len(frames) >= FEWEST_FOR_TARE:
         try:
-            return take(frames, pre, "file", np.inf)
+            return _said(take(frames, pre, "file", np.inf), warn)
         except NoBaseline as why:
             doubt = f"`untouched`: {why}"
             warn(doubt + "; using their mean")
@@ -121,6 +125,19 @@ def _mean_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None]) 
         sigma[good] = numbers.TARE_ASSUMED * mean
         warn(f"`untouched` has one row: a noise of {numbers.TARE_ASSUMED:g} of each measurement is assumed")
     return Baseline(z0, sigma, len(frames), "file", 0, doubt)
+
+
+def _said(found: Baseline, warn: Callable[[str], None]) -> Baseline:
+    """A tare whose doubt a person has read. Noise below the steps of a file is no doubt: in fewer rows it is none."""
+    if found.doubt == identical(found.frames):
+        warn(
+            "most values of `untouched` are the same in every row: "
+            f"a noise of {numbers.TARE_ASSUMED:g} of each measurement is assumed"
+        )
+        return replace(found, doubt="")
+    if found.doubt:
+        warn("`untouched`: " + found.doubt.removesuffix(", then run `skin tare`"))  # of a file there is none
+    return found
 
 
 def reconstruct(
@@ -186,10 +203,10 @@ def _with_assumed(
     if data.unit == UNIT_UNKNOWN:
         out["force"][:], out["force_sigma"][:] = np.nan, np.nan
         for row in np.flatnonzero(out["count"]):
-            others = [each for each in str(out["reasons"][row]).split() if each != "extrapolated"]  # a force of no unit
-            out["reasons"][row] = JOIN.join([*others, "uncalibrated_force"])
-    said = {"noise": noise, "age": age, "unit": data.unit, "columns": data.understood or IN_ORDER}
-    return out | {"assumed": np.array([*(said | {"left out": left_out or "nothing"}).items()])}
+            said = [each for each in str(out["reasons"][row]).split() if each != "extrapolated"]  # a force of no unit
+            out["reasons"][row] = JOIN.join(dict.fromkeys([*said, "uncalibrated_force"]))
+    assumed = {"noise": noise, "age": age, "unit": data.unit, "columns": data.understood or IN_ORDER}
+    return out | {"assumed": np.array([*(assumed | {"left out": left_out or "nothing"}).items()])}
 
 
 def _noise(sigma: Array, z0: Array, rows: int, of: str) -> str:
@@ -225,6 +242,8 @@ def _beside_references(
 ) -> None:
     """Each row against the reference just before it: the very frames that an import or a port gives of such a file."""
     frames, lost, doubt = frames_of(data), 0, ""
+    if data.reference is not None and data.unit == Input.unit:  # differences alone stand in steps of no |Z|
+        pipeline.pre.references.doubt = _too_coarse(data.reference, data.measurements)
     for row in rows:
         for values, kind in frames:
             frame = raw_frame(values, row, kind, separate=not sequence)
@@ -236,7 +255,7 @@ def _beside_references(
         lost += pipeline.pre.baseline is None
         doubt = doubt or getattr(pipeline.pre.baseline, "doubt", "")
     if doubt:
-        warn(f"{doubt} (--skin, --pattern)")
+        warn(f"{doubt} (--skin, --pattern)" if SEE in doubt else doubt)
     if lost:
         warn(f"{lost} of {len(out['valid'])} rows are not valid: their `reference` gives too few measurements")
 

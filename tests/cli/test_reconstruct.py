@@ -152,13 +152,38 @@ GAINS = np.exp(0.08 * np.random.default_rng(7).standard_normal(120))
 ])  # fmt: skip
 def test_rows_of_another_quantity_order_or_too_coarse_are_not_valid(noisy, of, says: str) -> None:
     rows = of(np.vstack([noisy["untouched"][:4], noisy["measurements"][:4]]))
-    beside = [Input(rows[4:], rows[:4], None)]
-    if "steps" not in says:
-        beside.append(Input(rows[4:], None, rows[:4]))
-    for data in beside:
+    for data in (Input(rows[4:], rows[:4], None), Input(rows[4:], None, rows[:4]), Input(rows[4:5], rows[:4], None)):
         lines: list[str] = []
         out = reconstructed(data, warn=lines.append)
         assert out["valid"].all() if not says else not out["valid"].any() and says in lines[-1], lines
+
+
+def test_steps_beside_noise_that_is_finer_and_rows_that_stand_twice_are_no_fault(scenes) -> None:
+    """Counts of 10 bits, most of them the same in each of 20 untouched rows; computed rows that stand twice each."""
+    clean = scenes["impedance_pairs"]
+    noise = 1 + 1e-4 * np.random.default_rng(2).standard_normal((20, 120))
+    counts = np.round(np.vstack([clean[0] * noise, clean[4:6]]) * 1023 / clean.max())
+    twice = clean[0] * np.repeat([1.0, 1.05], 2)[:, None]
+    measured, computed = Input(counts[20:], counts[:20], None), Input(twice, clean[:1], None)
+    for data, says in ((measured, "same in every row"), (computed, "one row")):
+        lines: list[str] = []
+        assert reconstructed(data, warn=lines.append)["valid"].all() and says in lines[0] and len(lines) == 1, lines
+
+
+def test_a_reason_is_given_once() -> None:
+    """disc16 has no force law, and differences alone have no unit: both say that no force is known."""
+    bundle, rng = Bundle.load("disc16"), np.random.default_rng(0)
+    data = read_scans({"delta": rng.standard_normal((2, len(bundle.pattern)))}, bundle)
+    for said in reconstruct(data, Skin(port="stub", bundle="disc16"), bundle)["reasons"]:
+        assert len(said.split()) == len({*said.split()}), said
+
+
+def test_the_console_says_why_a_tare_is_in_doubt(noisy) -> None:
+    lines: list[str] = []
+    noise = 1 + 1e-2 * np.random.default_rng(2).standard_normal((20, 120))
+    rows = Input(noisy["measurements"][:1], noisy["untouched"].mean(axis=0) * noise, None)
+    assert not reconstructed(rows, warn=lines.append)["valid"].any()
+    assert len(lines) == 1 and "scatter by" in lines[0] and "tare" not in lines[0]
 
 
 def test_what_is_no_impedance_in_untouched_rows_is_no_baseline():

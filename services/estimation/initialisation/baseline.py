@@ -24,7 +24,7 @@ OUT_OF_PROPORTION = 1e3  # of a measurement over the median one: pairs of one sh
 IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
 UNLIKE = 0.12  # the same of rows of a file: columns in another order, another unit or pattern misfit by 0.17 and more;
 # with gains of 10 % from pair to pair, electrodes off by 5 mm and a sheet uneven by 20 % touches are still placed right
-SEE = "see that the skin, the order of columns and the unit are those measured"
+SEE = "see that the skin, the order of columns and the unit are those measured, and that no electrode is open"
 REPEATED = 0.1  # of the values that equal the row before: noise of a third of a step gives 0.65, of 4 steps 0.07
 COARSE = 2e-3  # relative step of |Z|: by 9 bits touches of 1 N are placed 4 to 15 mm off, by 10 bits 2 at most
 LEAST_NOISE = 2e-6  # relative: about half a step of the board's 18 bits
@@ -153,9 +153,11 @@ def plausible_noise(z0: Array, sigma: Array) -> Array:
 
 def coarseness(rows: Array) -> str:
     """In which steps |Z| of (N, K) rows stands, to a person, where touches are misplaced by them; "" where they are
-    finer, or finer than the noise: a value that the next row has again is rare then.
+    finer, or finer than the noise: a value that the next row has again is rare then. A row that is the one before it
+    again says nothing.
     """
     steps = np.abs(np.diff(np.abs(rows), axis=0))
+    steps = steps[(steps > 0).any(axis=1)]
     steps = steps[np.isfinite(steps)]
     if not (steps > 0).any() or (steps == 0).mean() < REPEATED:
         return ""

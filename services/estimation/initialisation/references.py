@@ -27,6 +27,7 @@ class References:
 
     def __init__(self, measurements: int) -> None:
         self._k = measurements
+        self.doubt = ""  # what a reader of the whole file says against all of them
         self.reset()
 
     def reset(self) -> None:
@@ -58,7 +59,7 @@ class References:
         z0, sigma = np.where(good, amplitude, 0.0), np.where(good, self.noise * amplitude, np.inf)
         # Two scans share each of the differences that it was found from.
         off = implausible(z0, sigma, pre, UNLIKE)
-        doubt = off and f"the reference is {off}: {SEE}"
+        doubt = f"the reference is {off}: {SEE}" if off else self.doubt
         return Baseline(z0, sigma, 1, board, sample_ns, doubt, taken_by="file", noise_frames=self._found_from // 2)
 
     def sigma(self, baseline: Baseline, pre: PreReconstructor) -> Array:
