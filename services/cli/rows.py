@@ -31,8 +31,8 @@ UntouchedOption = Annotated[
 ]
 
 DO = {
-    "stale_baseline": "give 16 or more rows of `untouched` of just before, with nothing on the skin, of the skin and "
-    "the order of columns (--skin, --pattern) that are said",
+    "stale_baseline": "what is said above of `untouched` or `reference`; else give 16 or more rows of `untouched` of "
+    "just before, with nothing on the skin",
     "touched_at_start": "something stood on the skin in `untouched`: give rows without it",
     "out_of_distribution": "see that --skin and the order of columns (--pattern) are those measured, and that "
     "`untouched` is of just before",

@@ -16,13 +16,13 @@ from models.prereconstruction import PreReconstructor, noise_of_frames
 from protocol.frames import RawFrame
 from services.estimation.initialisation.baseline import (
     SEE,
-    UNLIKE,
     Baseline,
     NoBaseline,
     coarseness,
     identical,
-    implausible,
+    in_proportion,
     take,
+    unlike,
 )
 from services.estimation.values import numbers
 from services.estimation.values.judgement import Judgement, Verdict
@@ -89,7 +89,7 @@ def baseline_of(
     rows: (N, K) of the same file, which say in which steps it was measured.
     """
     found = _mean_of(frames, pre, warn)
-    if off := implausible(found.z0, found.sigma / found.frames**0.5, pre, UNLIKE):
+    if off := unlike(found.z0, found.sigma / found.frames**0.5, pre):
         doubt = f"`untouched` is {off}: {SEE} (--skin, --pattern)"
     elif not (doubt := _too_coarse(frames, frames[:0] if rows is None else rows)):
         return found
@@ -115,7 +115,7 @@ def _mean_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None]) 
             warn(doubt + "; using their mean")
     frames = np.where(np.isfinite(frames), frames, np.nan)
     mean = np.nanmean(frames, axis=0)
-    good = mean > 0  # false where there is none
+    good = in_proportion(mean)  # false where there is none
     z0, sigma = np.zeros(len(mean)), np.full(len(mean), np.inf)
     z0[good], mean = mean[good], mean[good]
     if len(frames) >= 2:

@@ -186,6 +186,15 @@ def test_the_console_says_why_a_tare_is_in_doubt(noisy) -> None:
     assert len(lines) == 1 and "scatter by" in lines[0] and "tare" not in lines[0]
 
 
+@pytest.mark.parametrize("beside", [1, 4, 20])
+@pytest.mark.parametrize("times", [0.02, 1e-6])
+def test_a_dead_measurement_or_three_cost_no_row(noisy, beside: int, times: float) -> None:
+    rows = np.vstack([noisy["untouched"][:beside], noisy["measurements"][[0, 4, 5]]])
+    rows[:, [3, 40, 77]] *= times
+    out = reconstructed(Input(rows[beside:], rows[:beside], None), age_s=10.0)
+    assert out["valid"].all() and out["count"].tolist() == [0, 1, 1]
+
+
 def test_what_is_no_impedance_in_untouched_rows_is_no_baseline():
     bundle = Bundle.load("square16")
     rows = bundle.z0 * np.random.default_rng(0).uniform(1.0, 1.001, (3, 120))

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 TAKING = "taking the baseline"  # what the status says until there is one
 OUT_OF_PROPORTION = 1e3  # of a measurement over the median one: pairs of one sheet differ by 10
 IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
+DEAD = 4.0  # times the bundle's proportion: contact impedances of 0.1 to 30 times change none by so much
 UNLIKE = 0.12  # the same of rows of a file: columns in another order, another unit or pattern misfit by 0.17 and more;
 # with gains of 10 % from pair to pair, electrodes off by 5 mm and a sheet uneven by 20 % touches are still placed right
 SEE = "see that the skin, the order of columns and the unit are those measured, and that no electrode is open"
@@ -214,6 +215,29 @@ def implausible(z0: Array, sigma: Array, pre: PreReconstructor, most: float) -> 
     if misfit <= np.hypot(most, noise):
         return ""
     return f"{100 * misfit:.1f} % off what the bundle predicts"
+
+
+def unlike(z0: Array, sigma: Array, pre: PreReconstructor) -> str:
+    """The same of rows of a file: how far |Z0| is from any skin of the bundle's, however mounted. As many measurements
+    as an electrode has do not count where they are out of proportion: a dead one says nothing of the others.
+    """
+    if pre.m.normalisation != "model":
+        return ""
+    live = z0 > 0
+    times = z0 / pre.m.z0
+    odd = live.copy()
+    odd[live] = np.abs(np.log(times[live] / np.median(times[live]))) > np.log(DEAD)
+    if odd.mean() <= 2 / len(pre.m.contact.T):
+        z0 = np.where(odd, 0.0, z0)
+    return implausible(z0, sigma, pre, UNLIKE)
+
+
+def in_proportion(z: Array) -> NDArray[np.bool_]:
+    """(K,) which |Z| may be impedances of the same sheet; NaN and 0: none."""
+    good: NDArray[np.bool_] = np.asarray(np.isfinite(z) & (z > 0))
+    if good.any():
+        good[good] = np.abs(np.log(z[good] / np.median(z[good]))) < np.log(OUT_OF_PROPORTION)
+    return good
 
 
 def implausibility(z0: Array, pre: PreReconstructor) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.prereconstruction import PreReconstructor, shrunk
-from services.estimation.initialisation.baseline import LEAST_NOISE, SEE, UNLIKE, Baseline, implausible
+from services.estimation.initialisation.baseline import LEAST_NOISE, SEE, Baseline, in_proportion, unlike
 from services.estimation.values import numbers
 from services.estimation.values.state import shaped
 
@@ -47,7 +47,7 @@ class References:
         """The baseline that this scan's |Z| (K,) is, NaN where a measurement failed; None where half of it did. It is
         in doubt where `pre` predicts another skin.
         """
-        self.scan, good = scan, np.isfinite(amplitude) & (amplitude > 0)
+        self.scan, good = scan, in_proportion(amplitude)
         if good.sum() < self._k / 2:
             return None
         self._row.append(np.where(good, amplitude, np.nan))
@@ -58,7 +58,7 @@ class References:
             self.typical = np.nan_to_num(_quietly(lambda scans: np.nanmedian(scans, axis=0), rows))
         z0, sigma = np.where(good, amplitude, 0.0), np.where(good, self.noise * amplitude, np.inf)
         # Two scans share each of the differences that it was found from.
-        off = implausible(z0, sigma, pre, UNLIKE)
+        off = unlike(z0, sigma, pre)
         doubt = f"the reference is {off}: {SEE}" if off else self.doubt
         return Baseline(z0, sigma, 1, board, sample_ns, doubt, taken_by="file", noise_frames=self._found_from // 2)
 
