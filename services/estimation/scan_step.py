@@ -113,7 +113,7 @@ class ScanStep:
         over = measured.log_z - skin.log_z0 - skin.drift.shift(measured.middle_s)
         return np.where(measured.live, skin.faults.taken_off(over), 0.0)
 
-    # --- looks ---
+    # --- gates ---
 
     def _glance(self) -> Seen | None:
         """What a first look sees where nothing touched before; None where it cannot tell."""

@@ -67,7 +67,7 @@ def find_skin(name: str) -> tuple[Skin, Bundle]:
 
 def mounted_bundle(frames: Array, bundle: Bundle, warn: Callable[[str], None]) -> Bundle:
     """The bundle calibrated from untouched |Z| (M, K), or as it is where there is nothing to find or nothing found."""
-    baseline = baseline_of(frames, bundle.prereconstructor(), lambda text: None)
+    baseline = _mean_of(frames, bundle.prereconstructor(), lambda text: None)
     if not needs_fit(baseline, bundle):
         return bundle
     search = MountingFit(bundle)
@@ -81,9 +81,7 @@ def mounted_bundle(frames: Array, bundle: Bundle, warn: Callable[[str], None]) -
     return found.bundle
 
 
-def baseline_of(
-    frames: Array, pre: PreReconstructor, warn: Callable[[str], None], rows: NDArray[Any] | None = None
-) -> Baseline:
+def baseline_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None], rows: NDArray[Any]) -> Baseline:
     """The tare of (M, K) untouched |Z|; where a board's tare would refuse, the mean all the same, in doubt.
 
     rows: (N, K) of the same file, which say in which steps it was measured.
@@ -91,7 +89,7 @@ def baseline_of(
     found = _mean_of(frames, pre, warn)
     if off := unlike(found.z0, found.sigma / found.frames**0.5, pre):
         doubt = f"`untouched` is {off}: {SEE} (--skin, --pattern)"
-    elif not (doubt := _too_coarse(frames, frames[:0] if rows is None else rows)):
+    elif not (doubt := _too_coarse(frames, rows)):
         return found
     warn(doubt)
     return replace(found, doubt=doubt)
@@ -109,13 +107,13 @@ def _mean_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None]) 
         frames = frames[:1]
     if len(frames) >= FEWEST_FOR_TARE:
         try:
-            return _said(take(frames, pre, "file", np.inf), warn)
+            return _report_doubt(take(frames, pre, "file"), warn)
         except NoBaseline as why:
             doubt = f"`untouched`: {why}"
             warn(doubt + "; using their mean")
     frames = np.where(np.isfinite(frames), frames, np.nan)
     mean = np.nanmean(frames, axis=0)
-    good = in_proportion(mean)  # false where there is none
+    good = in_proportion(np.log(np.where(mean > 0, mean, np.nan))[None])  # false where there is none
     z0, sigma = np.zeros(len(mean)), np.full(len(mean), np.inf)
     z0[good], mean = mean[good], mean[good]
     if len(frames) >= 2:
@@ -127,8 +125,8 @@ def _mean_of(frames: Array, pre: PreReconstructor, warn: Callable[[str], None]) 
     return Baseline(z0, sigma, len(frames), "file", 0, doubt)
 
 
-def _said(found: Baseline, warn: Callable[[str], None]) -> Baseline:
-    """A tare whose doubt a person has read. Noise below the steps of a file is no doubt: in fewer rows it is none."""
+def _report_doubt(found: Baseline, warn: Callable[[str], None]) -> Baseline:
+    """Print why a tare is in doubt. Noise below the steps of a file is no doubt: in fewer rows it is none."""
     if found.doubt == identical(found.frames):
         warn(
             "most values of `untouched` are the same in every row: "

@@ -199,7 +199,7 @@ def test_what_is_no_impedance_in_untouched_rows_is_no_baseline():
     bundle = Bundle.load("square16")
     rows = bundle.z0 * np.random.default_rng(0).uniform(1.0, 1.001, (3, 120))
     rows[:, 0], rows[:, 1], rows[:, 2] = 0.0, -1.0, np.nan
-    baseline = baseline_of(rows, bundle.prereconstructor(), print)
+    baseline = baseline_of(rows, bundle.prereconstructor(), print, rows)
     assert not baseline.z0[:3].any() and np.isinf(baseline.sigma[:3]).all() and not baseline.doubt
     assert (baseline.z0 > 0.9 * bundle.z0)[3:].all() and (baseline.sigma < 1e-3 * bundle.z0)[3:].all()
 

@@ -21,10 +21,9 @@ Array = NDArray[np.float64]
 
 TAKING = "taking the baseline"  # what the status says until there is one
 OUT_OF_PROPORTION = 1e3  # of a measurement over the median one: pairs of one sheet differ by 10
-IMPLAUSIBLE = 0.01  # rms relative misfit to the bundle's prediction beyond which something may be touching
 DEAD = 4.0  # times the bundle's proportion: contact impedances of 0.1 to 30 times change none by so much
-UNLIKE = 0.12  # the same of rows of a file: columns in another order, another unit or pattern misfit by 0.17 and more;
-# with gains of 10 % from pair to pair, electrodes off by 5 mm and a sheet uneven by 20 % touches are still placed right
+UNLIKE = 0.12  # rms relative misfit: columns in another order, another unit or pattern have 0.17 and more; with gains
+# of 10 % from pair to pair, electrodes off by 5 mm and a sheet uneven by 20 % touches are still placed right
 SEE = "see that the skin, the order of columns and the unit are those measured, and that no electrode is open"
 REPEATED = 0.1  # of the values that equal the row before: noise of a third of a step gives 0.65, of 4 steps 0.07
 COARSE = 2e-3  # relative step of |Z|: by 9 bits touches of 1 N are placed 4 to 15 mm off, by 10 bits 2 at most
@@ -83,8 +82,8 @@ class Baseline:
         return cls(z0, sigma, *rest, *provenance, noise_frames)
 
 
-def take(frames: Array, pre: PreReconstructor, board: str, most_misfit: float = IMPLAUSIBLE) -> Baseline:
-    """The baseline of (N, K) |Z|. Raises NoBaseline where the frames do not agree with each other.
+def take(frames: Array, pre: PreReconstructor, board: str) -> Baseline:
+    """The baseline of (N, K) |Z| of a file. Raises NoBaseline where the frames do not agree with each other.
 
     A measurement that is not finite in every frame gets an infinite sigma: it is left out until the next tare.
     """
@@ -101,8 +100,6 @@ def take(frames: Array, pre: PreReconstructor, board: str, most_misfit: float = 
     share = float(np.median(sigma[live] / z0[live]))
     if pre.m.normalisation == "model" and share > numbers.TARE_UNTRAINED:  # a measured bundle knows its own noise
         doubt = untrained(share)
-    if off := implausible(z0, sigma / len(frames) ** 0.5, pre, most_misfit):
-        doubt = f"the baseline is {off}: free the skin and run `skin tare`"
     return Baseline(z0, sigma, len(frames), board, 0, doubt)
 
 
@@ -110,9 +107,7 @@ def measured(log_z: Array) -> tuple[NDArray[np.bool_], float]:
     """(K,) which measurements of (N, K) log |Z| every frame has, in some proportion to the others, and their relative
     noise. Raises NoBaseline where those are too few, or scatter by too much.
     """
-    live: NDArray[np.bool_] = np.asarray(np.isfinite(log_z).all(axis=0))
-    if live.any():  # what is out of all proportion is no impedance of the same sheet
-        live[live] = (np.abs(log_z[:, live] - np.median(log_z[0, live])) < np.log(OUT_OF_PROPORTION)).all(axis=0)
+    live = in_proportion(log_z)
     if live.mean() < numbers.LEAST_LIVE:
         raise NoBaseline(
             f"only {int(live.sum())} of {len(live)} measurements give values: check the cable and the electrodes"
@@ -205,39 +200,30 @@ def agreement(scans: Array) -> Agreement:
     return Agreement(statistic, float(chi_square * estimated))
 
 
-def implausible(z0: Array, sigma: Array, pre: PreReconstructor, most: float) -> str:
-    """How far |Z0| (K,), known by sigma (K,), is from the bundle's skin untouched, to a person; "" where its rms
-    relative misfit is at most `most` beyond its noise.
-    """
-    known = np.isfinite(sigma) & (z0 > 0)
-    noise = float(np.sqrt(np.mean((sigma[known] / z0[known]) ** 2))) if known.any() else 0.0
-    misfit = implausibility(z0, pre)
-    if misfit <= np.hypot(most, noise):
-        return ""
-    return f"{100 * misfit:.1f} % off what the bundle predicts"
-
-
 def unlike(z0: Array, sigma: Array, pre: PreReconstructor) -> str:
-    """The same of rows of a file: how far |Z0| is from any skin of the bundle's, however mounted. As many measurements
-    as an electrode has do not count where they are out of proportion: a dead one says nothing of the others.
+    """How far |Z0| (K,), known by sigma (K,), is from any skin of the bundle's, however mounted, to a person; "" where
+    its misfit is at most UNLIKE beyond its noise. As many measurements as an electrode has do not count where they are
+    out of the bundle's proportion: a dead one says nothing of the others.
     """
     if pre.m.normalisation != "model":
         return ""
     live = z0 > 0
-    times = z0 / pre.m.z0
-    odd = live.copy()
-    odd[live] = np.abs(np.log(times[live] / np.median(times[live]))) > np.log(DEAD)
-    if odd.mean() <= 2 / len(pre.m.contact.T):
-        z0 = np.where(odd, 0.0, z0)
-    return implausible(z0, sigma, pre, UNLIKE)
+    times = np.log(z0[live] / pre.m.z0[live])
+    live[live] = np.abs(times - np.median(times)) < np.log(DEAD)
+    if (live < (z0 > 0)).mean() <= 2 / len(pre.m.contact.T):
+        z0 = np.where(live, z0, 0.0)
+    known = np.isfinite(sigma) & (z0 > 0)
+    noise = float(np.sqrt(np.mean((sigma[known] / z0[known]) ** 2))) if known.any() else 0.0
+    misfit = implausibility(z0, pre)
+    return f"{100 * misfit:.1f} % off what the bundle predicts" if misfit > np.hypot(UNLIKE, noise) else ""
 
 
-def in_proportion(z: Array) -> NDArray[np.bool_]:
-    """(K,) which |Z| may be impedances of the same sheet; NaN and 0: none."""
-    good: NDArray[np.bool_] = np.asarray(np.isfinite(z) & (z > 0))
-    if good.any():
-        good[good] = np.abs(np.log(z[good] / np.median(z[good]))) < np.log(OUT_OF_PROPORTION)
-    return good
+def in_proportion(log_z: Array) -> NDArray[np.bool_]:
+    """(K,) which of (N, K) log |Z| may be of impedances of the same sheet, in every row; NaN: not measured."""
+    live: NDArray[np.bool_] = np.asarray(np.isfinite(log_z).all(axis=0))
+    if live.any():
+        live[live] = (np.abs(log_z[:, live] - np.median(log_z[0, live])) < np.log(OUT_OF_PROPORTION)).all(axis=0)
+    return live
 
 
 def implausibility(z0: Array, pre: PreReconstructor) -> float:

@@ -47,7 +47,7 @@ class References:
         """The baseline that this scan's |Z| (K,) is, NaN where a measurement failed; None where half of it did. It is
         in doubt where `pre` predicts another skin.
         """
-        self.scan, good = scan, in_proportion(amplitude)
+        self.scan, good = scan, in_proportion(np.log(np.where(amplitude > 0, amplitude, np.nan))[None])
         if good.sum() < self._k / 2:
             return None
         self._row.append(np.where(good, amplitude, np.nan))
