@@ -12,9 +12,9 @@ from models.measurement.covariance.whitening import Whitening, leave_out
 from models.measurement.touch import ACTION, STATES
 from services.estimation.delayed_update import PendingScan
 from services.estimation.faults import advice
-from services.estimation.faults.board import BoardView, Explanation, PredictedScan
+from services.estimation.faults.board import Explanation
+from services.estimation.faults.isolation import FaultIsolation
 from services.estimation.gates import Seen
-from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import (
     AS_IT_IS,
     BURST,
@@ -28,7 +28,7 @@ from services.estimation.hypotheses.innovation import (
 )
 from services.estimation.hypotheses.selection import HypothesisSelection
 from services.estimation.initialisation.tare import Taring
-from services.estimation.tared import GridInformation, KnownBaseline, TaredSkin
+from services.estimation.tared import KnownBaseline, TaredSkin
 from services.estimation.track import coasted
 from services.estimation.track_update import update_tracks
 from services.estimation.values import numbers as n
@@ -188,7 +188,7 @@ class ScanStep:
         found = self._explain()
         innovation, answer, view = found.innovation, found.answer, found.view
         # as sound wires would show it
-        self.measured = replace(self.measured, log_z=view.at.untouched + view.y, live=view.live)
+        self.measured = replace(self.measured, log_z=view.untouched + view.y, live=view.live)
         if answer.nearly_holds:
             update_tracks(skin, innovation, answer, self.measured, now.unexplained_s)
         transient = answer.fit is not None and not len(skin.touches)  # it came and went within the scan
@@ -198,11 +198,11 @@ class ScanStep:
             skin.null_gate.keep(self.measured, skin.touches.ids, innovation, answer)
         skin.faults.follow(view, answer, passed_s, self.measured.whole)
         sound = skin.faults.sound
-        skin.isolation.decide(found)
+        FaultIsolation(skin, view.at, view.predicted).decide(found)
         if sound:
             self._learn(found)
         if sound and answer.fit is not None:
-            drifted = view.grown * (view.at.predicted.covariance @ (view.grown * answer.weighted_residual))
+            drifted = view.grown * (view.predicted.covariance @ (view.grown * answer.weighted_residual))
             innovation = replace(innovation, y=innovation.y - np.where(view.live, drifted, 0.0))
         self.judgements += self._judged(found)
         return self._publish(innovation, answer, answer.holds and not transient)
@@ -243,21 +243,9 @@ class ScanStep:
     def _explanation(self) -> Explanation:
         skin, measured = self.skin, self.measured
         predicted = skin.drift.predict(measured.middle_s, skin.noise.now.flicker)
-        selection = HypothesisSelection(skin, measured, predicted, self.now.unexplained_s)
-        at = PredictedScan(*measured.fields, predicted, skin.log_z0 + predicted.shift)
-        return skin.isolation(at, self._innovation_of, selection.answer, selection.recounted)
-
-    def _innovation_of(self, hypotheses: Hypotheses, view: BoardView, covariance: Array) -> Innovation:
-        now, skin, known, wire = self.now, self.skin, self.skin.grid_information, self.skin.faults.now.wire
-        same = known is not None and np.array_equal(known.live, view.live) and known.wire == wire
-        if known is None or not same or now.wholes - known.wholes >= n.LINE_SCANS:
-            each = hypotheses.grid.information(Whitening.of(covariance))
-            known = skin.grid_information = GridInformation(each, now.wholes, view.live, wire)
-        candidates = tuple(candidate.begun(self.measured) for candidate in now.candidates)
-        ids = skin.touches.ids
-        places = tuple(ids.index(each.id) if each.id in ids else -1 for each in now.candidates)
-        fields = replace(self.measured, live=view.live).fields
-        return Innovation(*fields, view.y, covariance, known.each, candidates, places).leaving(n.FOR_FAULTS)
+        now = self.now
+        selection = HypothesisSelection(skin, measured, predicted, now.unexplained_s, now.candidates, now.wholes)
+        return FaultIsolation(skin, measured, predicted).explain(selection)
 
     # --- what follows ---
 
@@ -322,7 +310,7 @@ class ScanStep:
         if answer.cause != AS_IT_IS or not measured.scan.believed:
             return
         skin.noise.learn_contacts(answer.weighted_residual, answer.white)
-        predicted = view.at.predicted
+        predicted = view.predicted
         due = predicted.at_s - skin.drift.now.at_s > n.TOUCHED_LEARNS_S
         same = len(predicted.x) == len(skin.drift.now.x)  # nothing has ended or slid away
         if due and same and not answer.recounted and self._complete:

@@ -15,7 +15,6 @@ from models.measurement.covariance.whitening import leave_out
 from models.measurement.responses.tables import SkinTables
 from services.estimation.delayed_update import DelayedUpdate, LearningState
 from services.estimation.faults.board import BoardFaults, FaultState
-from services.estimation.faults.isolation import FaultIsolation
 from services.estimation.faults.table import any_touches
 from services.estimation.faults.wires import WireFault
 from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, Memory, SkinFilter
@@ -93,7 +92,6 @@ class TaredSkin:
         self.grid_information: GridInformation | None = None
         self.aged = list[FilterState]()
         self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
-        self.isolation = FaultIsolation(self.tables, self.noise, self.touches, self.hypotheses, self.faults)
 
     def begin(self, scans: AgreedScans) -> None:
         """scans: those of the baseline."""

@@ -68,18 +68,12 @@ class FaultState:
 
 
 @dataclass(frozen=True)
-class PredictedScan(Observation):
-    """An observation with what the filter predicts of it."""
-
-    predicted: Prediction
-    untouched: Array  # (K,) log |Z| as the filter predicts it
-
-
-@dataclass(frozen=True)
 class BoardView:
     """One scan through the board."""
 
-    at: PredictedScan
+    at: Observation
+    predicted: Prediction
+    untouched: Array  # (K,) log |Z| as the filter predicts it
     log_z: Array  # (K,) 0 where it failed
     sound: Array  # (K,) what a board with sound wires would show, untouched
     failed: Mask
@@ -169,10 +163,11 @@ class BoardFaults:
 
     # --- what it makes of a scan ---
 
-    def look(self, at: PredictedScan) -> BoardView:
+    def look(self, at: Observation, predicted: Prediction, untouched: Array) -> BoardView:
+        """untouched (K,): log |Z| as the filter predicts it."""
         now, values = self.now, at.scan.values
         at_s = at.middle_s + at.times_s
-        sound = at.untouched + np.where(at_s >= now.gain_since_s, now.log_gain, now.log_gain_before)
+        sound = untouched + np.where(at_s >= now.gain_since_s, now.log_gain, now.log_gain_before)
         mean, spread = self._contacts(at_s, 2 * at.times_s / at.span_s)
         readable = np.isfinite(values) & (values > 0) & (at.scan.status == 0)
         log_z = np.log(np.where(readable, values, 1.0))
@@ -194,7 +189,9 @@ class BoardFaults:
             now.opens, now.lifted, now.silent = (), (), False  # what fails is left out: a wire that is wrong may be why
         dead = dead | (at_s < now.wire_since_s)  # measured by wires that were otherwise
         live = self._known & ~dead & ~self.member[:, list(now.opens)].any(axis=1)
-        return BoardView(at, log_z, sound, failed, live, shown, slopes, mean, spread, now.contact, apart)
+        return BoardView(
+            at, predicted, untouched, log_z, sound, failed, live, shown, slopes, mean, spread, now.contact, apart
+        )
 
     def _contacts(self, at_s: Array, course: Array) -> tuple[Array, Array]:
         now, columns = self.now, self.columns

@@ -2,87 +2,84 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.course import TouchCourse
-from models.measurement.covariance.noise import NoiseModel
 from models.measurement.fit import LEAST_MEAN
-from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import TouchPrior
-from services.estimation.faults.board import BoardFaults, BoardView, Explanation, PredictedScan, standing_covariance
+from services.estimation.faults.board import BoardView, Explanation, standing_covariance
 from services.estimation.faults.contact_or_touch import ContactOrTouchTest
-from services.estimation.faults.wires import WireFault
+from services.estimation.filter import Prediction
 from services.estimation.hypotheses.hypotheses import Hypotheses
-from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, ScoredAnswer, begun_as
-from services.estimation.touches import TouchTracks
+from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer, begun_as
+from services.estimation.hypotheses.selection import HypothesisSelection
+from services.estimation.tared import TaredSkin
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
-MakeInnovation = Callable[[Hypotheses, BoardView, Array], Innovation]
-Selecting = Callable[[Hypotheses, Innovation], ScoredAnswer]
-Recounting = Callable[[Hypotheses, Innovation, ScoredAnswer], ScoredAnswer]
 
 
 class FaultIsolation:
-    """Which fault of the board, if any, explains a scan better than touches alone."""
+    """Which fault of the board, if any, explains one scan better than touches alone."""
 
-    def __init__(
-        self, tables: SkinTables, noise: NoiseModel, touches: TouchTracks, hypotheses: Hypotheses, faults: BoardFaults
-    ) -> None:
-        self._tables, self._noise, self._touches = tables, noise, touches
-        self._hypotheses, self._faults = hypotheses, faults
-        self._contact_or_touch = ContactOrTouchTest(tables, hypotheses, faults)
-        self._through: tuple[WireFault, Hypotheses] | None = None
+    def __init__(self, skin: TaredSkin, at: Observation, predicted: Prediction) -> None:
+        self._skin, self._faults, self._touches = skin, skin.faults, skin.touches
+        self._at, self._predicted = at, predicted
 
-    def __call__(
-        self, at: PredictedScan, innovation_of: MakeInnovation, selecting: Selecting, recounting: Recounting
-    ) -> Explanation:
-        """innovation_of: of hypotheses, a view and a covariance; selecting: the likeliest touches of an innovation;
-        recounting: rather others than those of an answer.
-        """
-        faults = self._faults
-        skin, own = self._covariances(at)
-        standing = self._touches.expected(at)
+    @cached_property
+    def _covariances(self) -> tuple[Array, Array]:
+        """(K, K) of what changes with the skin, and of what the measurements add."""
+        contact, noise = self._skin.tables.contact, self._skin.noise
+        flicker = (contact * noise.now.flicker) @ contact.T
+        return self._predicted.covariance + flicker, noise.covariance(self._at.scan.part) - flicker
 
-        def rewired(view: BoardView) -> bool:
-            if not faults.suspects_wires(view):
-                return False
-            touched, _ = self._standing_change(standing, at)
-            return faults.wires_changed(view, touched, skin + self._hypotheses.inflated_drift(), own)
-
-        def asked(view: BoardView) -> Explanation:
-            hypotheses = self._through_wires(view)
-            innovation = innovation_of(hypotheses, view, view.covariance(skin, own))
-            return Explanation(view, innovation, recounting(hypotheses, innovation, selecting(hypotheses, innovation)))
-
-        before = faults.now.wire, faults.now.wire_since_s
-        view = faults.look(at)
-        if faults.now.wire is None and rewired(view):
-            view = faults.look(at)
-        found = asked(view)
+    def explain(self, selection: HypothesisSelection) -> Explanation:
+        """selection: of what touches may do."""
+        faults, before = self._faults, (self._faults.now.wire, self._faults.now.wire_since_s)
+        standing = self._touches.expected(self._at)
+        view = self._look()
+        if faults.now.wire is None and self._rewired(view, standing):
+            view = self._look()
+        found = self._asked(selection, view)
         odd = _doubtful(found.answer) or -1 in found.answer.association
-        if faults.now.wire is not None and odd and rewired(view):
-            found = asked(faults.look(at))
-        if faults.now.opens and faults.now.wire is None and (odd or (at.whole and self._touches.in_doubt)):
-            found = self._lifted(found, lambda: asked(faults.look(at)))
+        if faults.now.wire is not None and odd and self._rewired(view, standing):
+            found = self._asked(selection, self._look())
+        if faults.now.opens and faults.now.wire is None and (odd or (self._at.whole and self._touches.in_doubt)):
+            found = self._lifted(found, selection)
         if faults.asks(found.answer):
-            found = self._faulty(found, at, *self._standing_change(standing, at), selecting)
+            found = self._faulty(found, selection, standing)
         if not found.answer.nearly_holds:  # what does not explain its scan would stand beside any touch in the next one
             faults.now.wire, faults.now.wire_since_s = before
-        return self._doubted(found, at)
+        return self._doubted(found)
 
-    def _lifted(self, found: Explanation, ask: Callable[[], Explanation]) -> Explanation:
+    def _look(self) -> BoardView:
+        return self._faults.look(self._at, self._predicted, self._skin.log_z0 + self._predicted.shift)
+
+    def _rewired(self, view: BoardView, standing: Sequence[TouchPrior]) -> bool:
+        if not self._faults.suspects_wires(view):
+            return False
+        touched, _ = self._standing_change(standing)
+        skin, own = self._covariances
+        return self._faults.wires_changed(view, touched, skin + self._skin.hypotheses.inflated_drift(), own)
+
+    def _asked(self, selection: HypothesisSelection, view: BoardView) -> Explanation:
+        hypotheses = self._through_wires(view)
+        innovation = selection.innovation(hypotheses, view, view.covariance(*self._covariances))
+        answer = selection.recounted(hypotheses, innovation, selection.answer(hypotheses, innovation))
+        return Explanation(view, innovation, answer)
+
+    def _lifted(self, found: Explanation, selection: HypothesisSelection) -> Explanation:
         """Electrodes that are open may be off the skin, or on it and cut off: whichever explains the scan better. A
         touch that has just come is not known well enough to decide by little: the scans that follow ask again.
         """
         now = self._faults.now
         before, now.lifted = now.lifted, () if now.lifted else now.opens
-        other = ask()
+        other = self._asked(selection, self._look())
         sure = n.WIRE_SURE if -1 in found.answer.association else n.FAULT_SURE
         if (other.answer.holds, other.answer.score) > (found.answer.holds, found.answer.score + sure):
             return other
@@ -90,83 +87,83 @@ class FaultIsolation:
         return found
 
     def _faulty(
-        self, found: Explanation, at: PredictedScan, touched: Array, nearby: Array, selecting: Selecting
+        self, found: Explanation, selection: HypothesisSelection, standing: Sequence[TouchPrior]
     ) -> Explanation:
         hypotheses, fit = self._through_wires(found.view), found.answer.fit
-        likely = () if fit is None else begun_as(fit, at.span_s)
+        likely = () if fit is None else begun_as(fit, self._at.span_s)
+        touched, nearby = self._standing_change(standing)
 
         def ask(other: Innovation) -> ScoredAnswer:
-            return selecting(hypotheses, replace(other, candidates=likely, places=found.answer.association))
+            again = replace(other, candidates=likely, places=found.answer.association)
+            return selection.answer(hypotheses, again)
 
         if found.view.slopes is not None:
             touched = np.maximum(found.view.slopes @ touched, LEAST_MEAN)
         nearby = found.view.through(nearby)
         return self._faults.explained_by_fault(found, touched, nearby, ask) or found
 
-    def _doubted(self, found: Explanation, at: PredictedScan) -> Explanation:
+    def _doubted(self, found: Explanation) -> Explanation:
         """Is a touch on an electrode its contact impedance? Asked at some ages, when a weak one changes, and when it
         does not plainly explain a scan: a contact that changes under a touch is left when the touch goes.
         """
-        if self._faults.now.wire is not None or not at.whole:
+        if self._faults.now.wire is not None or not self._at.whole:
             return found
         doubtful = _doubtful(found.answer)
         for k, track in enumerate(self._touches.now.tracks):
             due = (track.contact_due or track.weakened) and not track.told_from_contact
             if not (due or doubtful) or track.ended or not self._faults.on_electrode(track.state):
                 continue
-            standing = self._touches.expected(at)
-            loose = self._touches.expected(at, manoeuvring=True)
-            del standing[k], loose[k]
-            touched, nearby = self._standing_change(standing, at, but=k)
-            ask = partial(self._given, standing, loose)
-            other = self._faults.explained_by_fault(found, touched, nearby, ask, doubted=track.state)
+            other = self._without(found, k)
             if other is not None:
                 self._touches.remove(k)
                 return other
         return found
 
+    def _without(self, found: Explanation, k: int) -> Explanation | None:
+        """A scan explained by a fault instead of the k-th track."""
+        standing, loose = self._touches.expected(self._at), self._touches.expected(self._at, manoeuvring=True)
+        del standing[k], loose[k]
+        touched, nearby = self._standing_change(standing, but=k)
+
+        def ask(other: Innovation) -> ScoredAnswer:
+            if not standing:
+                return self._skin.hypotheses.untouched(other)
+            return self._skin.hypotheses.ask(replace(other, candidates=(), places=()), standing, loose)
+
+        doubted = self._touches.now.tracks[k].state
+        return self._faults.explained_by_fault(found, touched, nearby, ask, doubted)
+
     def decide(self, found: Explanation) -> None:
         """Whether a contact that has changed is a touch on its electrode, once a whole scan is explained with it: one
         that is new, or that stands by now.
         """
-        at = found.view.at
-        if not (found.answer.holds and at.whole) or found.changed:
+        skin, faults, touches = self._skin, self._faults, self._touches
+        if not (found.answer.holds and self._at.whole) or found.changed:
             return
-        if not self._faults.now.doubt.undecided or self._faults.now.wire is not None:
+        if not faults.now.doubt.undecided or faults.now.wire is not None:
             return
-        skin, own = self._covariances(at)
-        touched, nearby = self._standing_change(self._touches.expected(at), at)
-        misfit = self._tables.misfit_of(float(touched @ touched))
-        touch = self._contact_or_touch(found, skin + nearby + misfit, own)
+        touched, nearby = self._standing_change(touches.expected(self._at))
+        misfit = skin.tables.misfit_of(float(touched @ touched))
+        changes, own = self._covariances
+        touch = ContactOrTouchTest(skin.tables, skin.hypotheses, faults)(found, changes + nearby + misfit, own)
         if touch is not None:
-            self._faults.drop_contact()
-            self._touches.tell(touch, at)
-        elif self._faults.now.contact < 0:
-            for track in self._touches.now.tracks:
-                track.told_from_contact = self._faults.on_electrode(track.state)
+            faults.drop_contact()
+            touches.tell(touch, self._at)
+        elif faults.now.contact < 0:
+            for track in touches.now.tracks:
+                track.told_from_contact = faults.on_electrode(track.state)
                 track.confirmed = track.confirmed or track.told_from_contact
 
-    def _covariances(self, at: PredictedScan) -> tuple[Array, Array]:
-        """(K, K) of what changes with the skin, and of what the measurements add."""
-        contact = self._tables.contact
-        flicker = (contact * self._noise.now.flicker) @ contact.T
-        return at.predicted.covariance + flicker, self._noise.covariance(at.scan.part) - flicker
-
-    def _given(self, standing: list[TouchPrior], loose: list[TouchPrior], innovation: Innovation) -> ScoredAnswer:
-        if not standing:
-            return self._hypotheses.untouched(innovation)
-        return self._hypotheses.ask(replace(innovation, candidates=(), places=()), standing, loose)
-
-    def _standing_change(self, priors: Sequence[TouchPrior], at: PredictedScan, but: int = -1) -> tuple[Array, Array]:
+    def _standing_change(self, priors: Sequence[TouchPrior], but: int = -1) -> tuple[Array, Array]:
         """(K,) what touches that stand do to each |Z|, and (K, K) the covariance of what they may have changed by: a
         strong one's outline and misfit are more than a contact impedance that begins to change. But: a track that is
         left out. The outline of a touch that has just come is not known: what is odd about it is no contact.
         """
-        k = len(at.times_s)
+        at, tables = self._at, self._skin.tables
         if not priors:
-            return np.zeros(k), np.zeros((k, k))
+            return np.zeros(len(at.times_s)), np.zeros((len(at.times_s), len(at.times_s)))
         states = np.stack([prior.start for prior in priors])
-        course = TouchCourse(self._tables.response, at.times_s, at.span_s)
+        course = TouchCourse(tables.response, at.times_s, at.span_s)
         columns = course.columns(states, priors, course.directions(states))
         known = [t.scans >= n.DOUBT_SCANS for k, t in enumerate(self._touches.now.tracks) if k != but]
         nearby = standing_covariance(columns.slopes, states)
@@ -174,18 +171,12 @@ class FaultIsolation:
             return np.maximum(columns.mean, LEAST_MEAN), nearby
         outlines = columns.shapes * np.concatenate([prior.shape_sd for prior in priors])
         change = columns.mean + columns.shapes @ np.concatenate([prior.shape for prior in priors])
-        nearby += outlines @ outlines.T + self._tables.misfit_of(float(change @ change))
+        nearby += outlines @ outlines.T + tables.misfit_of(float(change @ change))
         return np.maximum(change, LEAST_MEAN), nearby
 
     def _through_wires(self, view: BoardView) -> Hypotheses:
         """The skin through what is wrong with the board's wires."""
-        wire = self._faults.now.wire
-        if wire is None or view.slopes is None:
-            self._through = None
-            return self._hypotheses
-        if self._through is None or self._through[0] != wire:
-            self._through = wire, self._hypotheses.through(view.slopes)
-        return self._through[1]
+        return self._skin.hypotheses.through(self._faults.now.wire, view.slopes)
 
 
 def _doubtful(answer: ScoredAnswer) -> bool:

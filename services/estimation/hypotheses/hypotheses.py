@@ -31,6 +31,7 @@ from models.measurement.touch import (
     anywhere,
     plain,
 )
+from services.estimation.faults.wires import WireFault
 from services.estimation.filter import SkinFilter
 from services.estimation.hypotheses.detector import TouchDetector, newest_z2
 from services.estimation.hypotheses.innovation import (
@@ -93,18 +94,25 @@ class Hypotheses:
         self.grid, self.response, self.detector = tables.grid, tables.response, TouchDetector(tables.grid, tables.wrong)
         self._tables, self._noise, self._drift = tables, noise, drift
         self._slopes: Array | None = None
+        self._seen: tuple[WireFault, Hypotheses] | None = None  # through a fault of the wires
         # Touches that nothing explains for certain must not be taken for noise.
         self._wider = WIDER if tables.predicted else (MEMORY, DRIFT, BURST)
         self.process_noise_scale = 1.0  # times the faster drift: grows while nothing explains the skin
         self.wide = False  # the tracked touches were explained by a response that is wrong by more than it should be
 
-    def through(self, slopes: Array) -> Hypotheses:
-        """The same of a skin that is seen through a fault of the wires; slopes (K, K)."""
+    def through(self, wire: WireFault | None, slopes: Array | None) -> Hypotheses:
+        """The same of a skin that is seen through a fault of the wires; slopes (K, K): as that begins."""
+        if wire is None or slopes is None:
+            self._seen = None
+            return self
+        if self._seen is not None and self._seen[0] == wire:
+            return self._seen[1]
         seen = copy(self)
         seen._tables, seen.grid = self._tables.through(slopes), self.grid.through(slopes)
         seen.response = seen._tables.response
         seen.detector = TouchDetector(seen.grid, seen._tables.wrong)
         seen._slopes = slopes
+        self._seen = wire, seen
         return seen
 
     def inflated_drift(self) -> Array:

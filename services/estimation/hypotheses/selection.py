@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from models.measurement.covariance.whitening import Whitening
 from models.measurement.touch import anywhere
+from services.estimation.faults.board import BoardView
 from services.estimation.filter import Prediction
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import (
     AS_IT_IS,
     Innovation,
     Observation,
+    OpenTouch,
     Priors,
     ScoredAnswer,
     StepBudget,
 )
 from services.estimation.hypotheses.split_merge import SplitMergeTest
-from services.estimation.tared import TaredSkin
+from services.estimation.tared import GridInformation, TaredSkin
 from services.estimation.values import numbers as n
+
+Array = NDArray[np.float64]
 
 
 @dataclass
@@ -31,6 +37,8 @@ class HypothesisSelection:
     measured: Observation
     predicted: Prediction
     unexplained_s: float  # for which nothing has explained the scans before
+    left_open: Sequence[OpenTouch]
+    wholes: int  # whole scans since the tare
     searched: bool = False  # anew, whatever is tracked: once, it costs four scans' steps
 
     @property
@@ -41,6 +49,19 @@ class HypothesisSelection:
     def _due(self) -> bool:
         """Ever more seldom while nothing explains them: at 1, 2, 4, 8 ... scans."""
         return not self._unexplained_scans & (self._unexplained_scans - 1)
+
+    def innovation(self, hypotheses: Hypotheses, view: BoardView, covariance: Array) -> Innovation:
+        """Of a view of the scan; covariance (K, K): of its y."""
+        skin, known, wire = self.skin, self.skin.grid_information, self.skin.faults.now.wire
+        same = known is not None and np.array_equal(known.live, view.live) and known.wire == wire
+        if known is None or not same or self.wholes - known.wholes >= n.LINE_SCANS:
+            each = hypotheses.grid.information(Whitening.of(covariance))
+            known = skin.grid_information = GridInformation(each, self.wholes, view.live, wire)
+        candidates = tuple(candidate.begun(self.measured) for candidate in self.left_open)
+        ids = skin.touches.ids
+        places = tuple(ids.index(each.id) if each.id in ids else -1 for each in self.left_open)
+        fields = replace(self.measured, live=view.live).fields
+        return Innovation(*fields, view.y, covariance, known.each, candidates, places).leaving(n.FOR_FAULTS)
 
     def answer(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """The likeliest one."""
