@@ -37,7 +37,7 @@ from models.measurement.touch import (
 Array = NDArray[np.float64]
 
 LEAST_MEAN = -0.9  # relative change: nothing takes all of an impedance away
-SIZE_CHANGED = (0.4, 2.5)  # of the squared change, beyond which its misfit is taken anew
+SIZE_CHANGED = 2.5  # times the squared change, or its inverse, beyond which its misfit is taken anew
 MOST_DAMPING = 1e4
 
 
@@ -50,7 +50,7 @@ class KnownWhitening:
 
     def fits(self, size2: float) -> bool:
         """Whether the misfit of touches of another squared change is nearly the same."""
-        return SIZE_CHANGED[0] < size2 / self.size2 < SIZE_CHANGED[1]
+        return 1 / SIZE_CHANGED < size2 / self.size2 < SIZE_CHANGED
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class TouchFitter:
             self._whiten(point.states, point.columns)
         if moved or changed:
             point = self._descend(self._linearised(point.states, rest, self._columns(point.states, rest)), most_steps)
-        if _size2(point.columns) < SIZE_CHANGED[0] * self._known.size2:  # larger touches' misfit explains anything
+        if _size2(point.columns) < 1 / SIZE_CHANGED * self._known.size2:  # larger touches' misfit explains anything
             self._whiten(point.states, point.columns)
             point = self._linearised(point.states, point.rest, point.columns)
         return self._posterior(point)
@@ -240,7 +240,7 @@ class TouchFitter:
         return point
 
     def _whiten(self, states: Array, columns: TouchColumns) -> None:
-        size2, scene = max(_size2(columns), 1e-12), self._scene
+        size2, scene = max(_size2(columns), n.TINY), self._scene
         known = scene.known
         if known is not None and known.fits(size2):
             self._known = known
@@ -300,7 +300,7 @@ class TouchFitter:
         for state, each in zip(point.states, own, strict=True):
             most = max(n.STEP_SHARE * float(np.exp(state[LOG_RADIUS])), n.LEAST_STEP)
             way = float(np.hypot(each[X], each[Y]))
-            each *= min(1.0, most / max(way, 1e-9), n.STEP_LOG / max(abs(each[LOG_RADIUS]), 1e-9))
+            each *= min(1.0, most / max(way, n.TINY), n.STEP_LOG / max(abs(each[LOG_RADIUS]), n.TINY))
         states, rest = within_limits(point.states + own), point.rest + step[own.size :]
         return self._linearised(states, rest, self._columns(states, rest))
 

@@ -24,6 +24,8 @@ class Number(float):
         return type(self), (float(self), self.unit, self.meaning, self.origin)
 
 
+SIGMAS = Number(3.0, "-", "standard deviations within which chance stays", "derived: one in 370")
+TINY = Number(1e-12, "-", "in place of nothing, where it divides", "derived: no noise makes as little")
 FALSE_ALARM_Z2 = Number(44.0, "-", "z^2 of the best disc that is a touch", "derived: 2 (ln 650 discs + ln 1e6) + 3")
 FIELD_START = Number(1e-5, "-", "the field at the tare", "derived: 64 frames at 80 dB")
 CONTACT_START = Number(1e-3, "-", "a contact impedance in a frame of the tare", "derived: 64 frames at 80 dB")

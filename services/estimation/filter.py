@@ -240,7 +240,7 @@ class SkinFilter:
             remembered = float(predicted.x[own].sum() + reach @ weighted_residual)
             whitened = white(reach)
             variance = float(predicted.p[own, own].sum() - whitened @ whitened)
-            if remembered > memory.most(predicted.at_s) + n.MEMORY_SIGMAS * np.sqrt(max(variance, 0.0)):
+            if remembered > memory.most(predicted.at_s) + n.SIGMAS * np.sqrt(max(variance, 0.0)):
                 return memory
         return None
 

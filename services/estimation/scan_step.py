@@ -20,6 +20,7 @@ from services.estimation.hypotheses.innovation import (
     BURST,
     DRIFT,
     MEMORY,
+    NANOSECOND,
     NOISE,
     Innovation,
     Observation,
@@ -363,7 +364,7 @@ class ScanStep:
             z2 += [track.z2 for track in touches.lasting]
         else:
             variance = np.diag(answer.fit.covariance)[ACTION::STATES]
-            z2 += list(answer.fit.states[:, ACTION] ** 2 / np.maximum(variance, 1e-18))
+            z2 += list(answer.fit.states[:, ACTION] ** 2 / np.maximum(variance, n.TINY**2))
         if answer.fit is not None and not skin.tables.predicted:
             z2.append(skin.hypotheses.untouched(innovation).next_touch_z2)
         changing = float(skin.tables.predicted and (unsure or not explained))
@@ -371,11 +372,11 @@ class ScanStep:
 
     def _touches_published(self, innovation: Innovation, answer: ScoredAnswer) -> tuple[TouchEstimate, ...]:
         """Confirmed tracks; roughly, those published last where nothing tells how they go on, or if they are one."""
-        scan, published, now = self.measured.scan, self.now.published, self.skin.touches.now
-        passed_s, sample_s = (scan.sample_ns - self.now.published_ns) * 1e-9, scan.sample_ns * 1e-9
+        sample_s, published, now = self.measured.sample_s, self.now.published, self.skin.touches.now
+        passed_s = (self.measured.scan.sample_ns - self.now.published_ns) * NANOSECOND
         if not answer.nearly_holds:
             return tuple(coasted(touch, passed_s) for touch in published)
-        unexplained = float(np.linalg.norm(answer.residual)) / max(float(np.linalg.norm(innovation.y)), 1e-12)
+        unexplained = float(np.linalg.norm(answer.residual)) / max(float(np.linalg.norm(innovation.y)), n.TINY)
         lasting = [track for track in now.tracks if track.confirmed and track.acts_at(sample_s)]
         open_ids = [track.id for track in (*now.tracks, *now.dropped) if not track.confirmed]
         return (

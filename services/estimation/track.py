@@ -155,7 +155,7 @@ class TrackedTouch:
         free = anywhere(0.0, 0.0, max(float(state[ACTION]), self.peak), span_s)
         mean, sd = free.mean.copy(), free.sd.copy()
         if not self.lost:
-            known = 3 * float(np.sqrt(self.covariance[X, X] + self.covariance[Y, Y]))
+            known = n.SIGMAS * float(np.sqrt(self.covariance[X, X] + self.covariance[Y, Y]))
             mean[PLACE], sd[PLACE] = state[PLACE], max(n.PLACE_MOVES * (1 + 3 * manoeuvring), known)
         sd[VELOCITY] = MOST_WAY / span_s
         if self.steady and not manoeuvring:
@@ -175,8 +175,8 @@ class TrackedTouch:
             return
         sd = self.sd
         way, change = np.hypot(*state[VELOCITY]) * span_s, abs(state[RATE]) * span_s
-        self.moves = bool(way > max(n.STILL_WAY, 3 * float(np.hypot(*sd[VELOCITY])) * span_s))
-        if self.moves or change > max(n.STILL_CHANGE * abs(state[ACTION]), 3 * sd[RATE] * span_s):
+        self.moves = bool(way > max(n.STILL_WAY, n.SIGMAS * float(np.hypot(*sd[VELOCITY])) * span_s))
+        if self.moves or change > max(n.STILL_CHANGE * abs(state[ACTION]), n.SIGMAS * sd[RATE] * span_s):
             self.still = 0
         elif whole:
             self.still += 1
@@ -231,7 +231,7 @@ class TrackedTouch:
         """Action and its standard deviation at an instant, seconds after that of the state."""
         to_then = np.array([1.0, after_s])
         both = self.covariance[np.ix_([ACTION, RATE], [ACTION, RATE])]
-        return float(to_then @ self.state[[ACTION, RATE]]), float(np.sqrt(max(to_then @ both @ to_then, 1e-18)))
+        return float(to_then @ self.state[[ACTION, RATE]]), float(np.sqrt(max(to_then @ both @ to_then, n.TINY**2)))
 
     def estimate(self, sample_s: float, span_s: float, unexplained: float) -> TouchEstimate:
         """It at the instant sample_s, with the covariance of that instant."""
@@ -246,10 +246,9 @@ class TrackedTouch:
         log_radius, action = float(state[LOG_RADIUS]), max(float(state[ACTION]), 0.0)
         strength = action / (np.pi * np.exp(2 * log_radius))
         drop = drop_of(action, log_radius)
-        slopes = np.zeros((4, STATES))  # of x, y, log radius and drop
-        slopes[0, X] = slopes[1, Y] = slopes[2, LOG_RADIUS] = 1.0
-        slopes[3, ACTION] = drop / max(action, 1e-12) / (1 + strength / 2)
-        slopes[3, LOG_RADIUS] = -2 * drop / (1 + strength / 2)
+        slopes = np.eye(STATES)[[X, Y, LOG_RADIUS, ACTION]]  # of x, y, log radius and drop
+        slopes[-1, ACTION] = drop / max(action, n.TINY) / (1 + strength / 2)
+        slopes[-1, LOG_RADIUS] = -2 * drop / (1 + strength / 2)
         x, y = state[PLACE]
         if self.steady_for >= n.STILL_SCANS and self._stays():
             x, y, _ = self.steady_position  # as sure as by one scan: what all of them get wrong is not known

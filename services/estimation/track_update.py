@@ -58,7 +58,7 @@ def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> No
     may_wait = skin.tables.predicted and not separate
     for track in skin.touches.now.tracks:
         # How strongly it presses a first part hardly tells: its place and that it is there, it does.
-        placed = place_tells and track.place_sd < n.PLACED and track.z2 > n.PLACED_Z2
+        placed = place_tells and track.place_sd < n.PLACED and track.z2 > n.ACTS_Z2
         surely = (track.z2 > least_z2 or placed) and not skin.faults.in_question(track.state)
         # One that is broad may be two that began together, and is where neither of them is.
         broad = bool(track.state[LOG_RADIUS] > np.log(n.BROAD)) and track.scans < n.SURE_SCANS

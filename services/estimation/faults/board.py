@@ -183,7 +183,7 @@ class BoardFaults:
             apart = self.exchanged  # each measurement is another's then, its contacts as well
             found = self.maps.one(now.wire, np.exp(sound if apart else sound + np.log1p(mean)))
             failed, dead = self._known & ~readable, ~readable | found.blind
-            shown, slopes = np.log(np.maximum(found.values, 1e-9)), found.slopes
+            shown, slopes = np.log(np.maximum(found.values, n.TINY)), found.slopes
             if apart:
                 mean, spread = found.slopes @ mean, found.slopes @ spread
             now.opens, now.lifted, now.silent = (), (), False  # what fails is left out: a wire that is wrong may be why
@@ -349,7 +349,7 @@ class BoardFaults:
     def _may_be_a_contact(self, fit: FoundTouches, k: int) -> bool:
         """Whether a touch that was found is so near an electrode that a contact impedance may look like it."""
         variance = fit.covariance[STATES * k : STATES * k + 2, STATES * k : STATES * k + 2]
-        unsure = 3 * float(np.sqrt(max(np.trace(variance), 0.0)))
+        unsure = n.SIGMAS * float(np.sqrt(max(np.trace(variance), 0.0)))
         return bool(self._gaps(fit.states[k]).min() < n.ON_ELECTRODE + unsure)
 
     def _likeliest_changes(

@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 STEPS = 3
-MOST_LOG = 3.0  # of an impedance over its prediction: beyond, nothing is told any more
-SIZE, SHUNT, COURSE = range(3)  # of a change: a, e and s
+MOST_LOG = float(np.log(n.FAR))  # of an impedance over its prediction: beyond, nothing is told any more
+SIZE, SHUNT, COURSE = 0, 1, 2  # of a change: a, e and s
 GAIN = -1  # in place of an electrode
 
 
@@ -159,12 +159,12 @@ class ContactColumns:
     @staticmethod
     def _first(scan: Unexplained, columns: Array, settled: Array) -> tuple[Array, Array]:
         """(n, 3) of a change that is no logarithm's, linear in the impedance itself, and how much it explains (n,)."""
-        change = np.expm1(np.minimum(scan.y, np.log(n.FAR)))
+        change = np.expm1(np.minimum(scan.y, MOST_LOG))
         weighted = (columns[:, :, SIZE] + columns[:, :, SHUNT]) / (1 + change)
         design = weighted @ scan.white.w.T
         seen = scan.white(change / (1 + change))
         along, precision = design @ seen, (design**2).sum(axis=1) + n.CONTACT_CHANGES**-2
-        x = np.zeros((len(columns), 3))
+        x = np.zeros_like(columns[:, 0])
         x[:, SIZE] = np.maximum(along / precision, LEAST_MEAN - settled)
         return x, along**2 / precision
 
@@ -187,10 +187,9 @@ def _left(scan: Unexplained, changed: Array) -> Array:
 
 def _linearised(scan: Unexplained, columns: Array, x: Array, settled: Array) -> tuple[Array, Array, Array]:
     """Whitened residuals (n, K) and slopes (n, K, 3) at x (n, 3), and the priors' precisions there (n, 3)."""
-    both, mean = np.empty((*columns.shape[:2], 4)), _changed(columns, x, settled)
-    both[:, :, 0] = _left(scan, mean)
+    mean = _changed(columns, x, settled)
+    both = np.concatenate([_left(scan, mean)[:, :, None], columns], axis=-1)
     slopes = both[:, :, 1:]
-    slopes[:] = columns
     slopes[:, :, SIZE] += columns[:, :, SHUNT] * _shunt_slope(x[:, SIZE], settled)[:, None]
     slopes /= (1 + mean)[:, :, None]
     both = scan.white.w @ both
@@ -227,7 +226,7 @@ def _onsets(scan: Unexplained, columns: Array) -> Array:
     column = columns[order]
     along = np.cumsum(weight * column * scan.y[order, None], axis=0)
     information = np.cumsum(weight * column**2, axis=0)
-    explains = np.where(information > 0, along**2 / np.maximum(information, 1e-12), 0.0)
+    explains = np.where(information > 0, along**2 / np.maximum(information, n.TINY), 0.0)
     return np.asarray(scan.times_s[order[explains.argmax(axis=0)]])
 
 

@@ -74,7 +74,7 @@ class WireTable:
         values = np.vstack([z0, self._maps.every(z0)])
         blind = blinded(values, z0)
         blind[0] = False
-        left = np.where(scan.failed | blind | ~scan.known, 0.0, scan.log_z - np.log(np.maximum(values, 1e-9)))
+        left = np.where(scan.failed | blind | ~scan.known, 0.0, scan.log_z - np.log(np.maximum(values, n.TINY)))
         left = np.clip(left, -MOST_LOG, MOST_LOG)
         log_prior = np.where(scan.failed & blind, n.LOG_PRIOR_EXPECTED_FAILURE, 0.0)
         log_prior += np.where(scan.failed ^ blind, n.LOG_PRIOR_FAILURE, 0.0)

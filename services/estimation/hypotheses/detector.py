@@ -63,7 +63,7 @@ class TouchDetector:
         columns = column[:, None] * (innovation.times_s[:, None] >= instants)
         along, exact = np.maximum(columns.T @ answer.weighted_residual, 0.0), answer.informations(columns)
         more = 2 * np.log(len(instants) / len(ONSETS))  # so many were tried
-        z2 = along**2 / np.maximum(exact, 1e-12) - n.ONSET_Z2 - more
+        z2 = along**2 / np.maximum(exact, n.TINY) - n.ONSET_Z2 - more
         k = int(z2.argmax())
         if z2[k] <= best.z2:
             return best

@@ -345,7 +345,7 @@ class Hypotheses:
         live, tables = int(innovation.live.sum()), self._tables
         misfit = max(float(MISFIT_WIDE), 2 * tables.wrong) if wide else tables.wrong
         covariance = innovation.covariance if tables.map is None else innovation.covariance + tables.map.error
-        sample_s = innovation.scan.sample_ns * 1e-9 - innovation.middle_s
+        sample_s = innovation.sample_s - innovation.middle_s
         scene = FittedScan(innovation.y, covariance, course, tables.misfit, live, known, turned, sample_s)
         affordable = max(0.0, innovation.budget.left - innovation.keeps) / len(priors)
         fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(affordable)))
@@ -443,16 +443,17 @@ class Hypotheses:
             seen = innovation.white(np.where(innovation.live, np.expm1(innovation.y) - beside, 0.0))
             whitened = innovation.white(columns)
             along = np.maximum(whitened.T @ seen, 0.0)
-            at = int((along**2 / np.maximum(np.sum(whitened**2, axis=0), 1e-12)).argmax())
+            at = int((along**2 / np.maximum(np.sum(whitened**2, axis=0), n.TINY)).argmax())
             priors[k] = replace(priors[k], since_s=float(instants[at]))
         return priors
 
     def _turned(self, innovation: Innovation, tracked: Priors, turn: StrengthStep | None) -> list[ScoredAnswer]:
         """Strengths changed at once: that of one in mid-scan, or any at its end, as they go or are pressed harder."""
         priors = list(tracked)
+        before_s = -0.5 * innovation.span_s - innovation.span_s
         for k, prior in enumerate(tracked):
             # Until then it acts as it did, since a scan before this one: else two that begin would look like one.
-            if prior.until_s < np.inf or prior.since_s >= -1.5 * innovation.span_s:
+            if prior.until_s < np.inf or prior.since_s >= before_s:
                 continue
             if turn is None:
                 steady = acting_steadily(prior, float(prior.start[ACTION]), innovation.span_s)
@@ -512,7 +513,7 @@ class Hypotheses:
         counts = np.where(innovation.live, 1 / (1 + change), 0.0)
         residual = answer.white(np.where(innovation.live, innovation.y - np.log1p(change), 0.0))
         columns = answer.white(missing * counts[:, None])
-        return np.asarray((residual @ columns) / np.maximum(np.sum(columns**2, axis=0), 1e-12))
+        return np.asarray((residual @ columns) / np.maximum(np.sum(columns**2, axis=0), n.TINY))
 
     def _unlike(self, innovation: Innovation, answer: ScoredAnswer, changes: Array) -> Array:
         """(n,) squared sigmas of what changes (K, n) leave of a scan, by the covariance of an answer."""

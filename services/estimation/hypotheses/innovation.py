@@ -21,6 +21,7 @@ Priors = Sequence[TouchPrior]
 
 ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
+NANOSECOND = 1e-9  # [s]
 JUST_BEFORE_S = 1e-5  # a value: the next scans, by whose clock its time is rounded, must not leave it out
 LOG_PRIORS = {
     AS_IT_IS: 0.0,
@@ -65,7 +66,12 @@ class Observation:
 
     @property
     def middle_s(self) -> float:
-        return self.scan.at_ns * 1e-9 - self.scan.duration_s / 2
+        return self.scan.at_ns * NANOSECOND - self.scan.duration_s / 2
+
+    @property
+    def sample_s(self) -> float:
+        """For when what is said of it stands."""
+        return self.scan.sample_ns * NANOSECOND
 
     @property
     def oldest_s(self) -> float:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START, WHITE, Number
+from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START, SIGMAS, TINY, WHITE, Number
 
-__all__ = ["CONTACT_START", "FALSE_ALARM_Z2", "FIELD_START", "WHITE"]  # beside this module's own
+__all__ = ["CONTACT_START", "FALSE_ALARM_Z2", "FIELD_START", "SIGMAS", "TINY", "WHITE"]  # beside this module's own
 
 GLANCE_Z2 = Number(36.0, "-", "the same at a first look", "derived: the whitening is 0.5 s old, 10 % of z")
 GLANCE_S = Number(0.5, "s", "for which a whitening does for a first look", "derived: drift beyond is 1e-5")
@@ -41,7 +41,6 @@ MEMORY_SHARE = Number(0.01, "-", "of a touch that stays, each state", "measured:
 MEMORY_SD = Number(0.012, "-", "its standard deviation", "derived: of that range")
 MEMORY_WALK = Number(0.5, "-", "of itself in a time constant", "chosen: no foam is exponential")
 MEMORY_MOST = Number(0.05, "-", "share above which it is a touch, not memory", "chosen: the promise, below 1 to 8 %")
-MEMORY_SIGMAS = Number(3.0, "-", "sigmas above that share", "derived: one in a thousand")
 MEMORY_DOUBT_S = Number(3.0, "s", "after which a memory is not doubted any more", "derived: beyond the fast recovery")
 MEMORY_FAINT = Number(0.5, "-", "of WHITE: a fainter memory is forgotten", "derived: half a sigma of a whole scan")
 REFUSED_MOST = Number(0.5, "-", "change of |Z| that a touch makes at most", "derived: a drop of 1 under an electrode")
@@ -67,7 +66,6 @@ MEET_S = Number(2.0, "s", "for which two are kept apart by what they were", "cho
 GOES = Number(0.7, "-", "of its action, below which a touch is going", "chosen: above any relaxation")
 ENDED = Number(0.05, "-", "of its greatest action, below which it has ended", "derived: MEMORY_MOST")
 PLACED = Number(0.06, "unit", "standard deviation of a new touch's place with which it is shown", "derived: 3 mm, near")
-PLACED_Z2 = Number(9.0, "-", "z^2 of such a touch", "derived: 3 sigmas, as that it is there is known by SURE_Z2")
 BROAD = Number(0.41, "unit", "radius of a new touch that may as well be two", "derived: 20 mm, 1.5 AREA_LOG_SD up")
 SURE_Z2 = Number(44.0, "-", "z^2 of a new touch that is shown", "derived: FALSE_ALARM_Z2")
 """What touches do from scan to scan."""
@@ -200,7 +198,7 @@ GAIN_LASTS_S = Number(1.0, "s", "for which such a step must last to be taken ove
 GAIN_BACK = Number(0.01, "-", "log of what is left of it when it ends", "derived: drift of a minute")
 CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itself", "derived: a fifth of its walk")
 ON_ELECTRODE = Number(0.2, "unit", "gap below which a touch changes an electrode's contact", "derived: its width")
-ACTS_Z2 = Number(9.0, "-", "squared sigmas of a touch's action, below which it may be none", "derived: 3 sigmas")
+ACTS_Z2 = SIGMAS**2  # squared sigmas of a touch's action, below which it may be none
 SMALL = Number(0.2, "unit", "radius of a touch that may be an electrode's contact", "derived: an electrode's width")
 LOG_PRIOR_SMALL = Number(-8.0, "nat", "log prior of such a touch on an electrode", "derived: its share of the sheet")
 COUNT_DOUBTS = (2, 8, 24)  # whole scans of a touch, at which it is asked whether it is several
