@@ -20,8 +20,7 @@ from services.contacts.lasting import LASTS_NS
 from services.describe import BaselineNews, FrameRate, describe, force, symmetry
 from services.estimation.by_bundle import skin_tables
 from services.estimation.estimator import LAYOUT, Estimator
-from services.estimation.faults import checks
-from services.estimation.faults.advice import sentences
+from services.estimation.faults.advice import sentences, unchecked
 from services.estimation.images.reconstruct import Operators, Reconstructed, Reconstruction, sigma_of_mean
 from services.estimation.initialisation.baseline import TAKING, Baseline, NoBaseline, plausible_noise
 from services.estimation.initialisation.references import References
@@ -56,7 +55,7 @@ class Preprocessing(Stage):
         super().__init__(name)
         self.config = skin
         self.linearisation = Linearisation(name, bundle)
-        self._unchecked = checks.sentence(bundle)
+        self._unchecked = unchecked(bundle)
         self._force, self._symmetry = force(skin, bundle), symmetry(skin, bundle)
         self.always_reconstruct = False  # offline: an image of every scan, touched or not
         self.each_alone = False  # offline: frames that do not follow each other

@@ -27,7 +27,7 @@ from services.cli.doctor_mounting import mounting_found
 from services.contacts.force.law import ForceLaw, known_radius
 from services.contacts.surface import placement
 from services.describe import ON, geometry, symmetry
-from services.estimation.faults import checks
+from services.estimation.faults import advice
 from services.estimation.initialisation.baseline import implausibility
 from services.runtime import room
 from services.runtime.config import RECORDINGS, ConfigError, Skin, config_path, load
@@ -98,7 +98,7 @@ def _skin(name: str, skin: Skin, running: bool, ours: bool) -> Iterator[Finding]
         "with its network" if bundle.network_path(skin.network if skin.network != "none" else "full") else "no network"
     )
     yield Finding("OK", f"{name}: bundle", f"{bundle.name}, every sha256 right ({bundle.hash[:12]}), {network}")
-    yield Finding("OK", f"{name}: checks", checks.sentence(bundle) or "all of them, on every frame")
+    yield Finding("OK", f"{name}: checks", advice.unchecked(bundle) or "all of them, on every frame")
     try:
         known_radius(skin, bundle, name)
     except ConfigError as why:

@@ -15,8 +15,7 @@ from models.measurement.covariance.whitening import leave_out
 from models.measurement.responses.tables import SkinTables
 from services.estimation.delayed_update import DelayedUpdate, LearningState
 from services.estimation.faults.board import BoardFaults, FaultState
-from services.estimation.faults.table import any_touches
-from services.estimation.faults.wires import WireFault
+from services.estimation.faults.wires import WireFault, any_touches
 from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, Memory, SkinFilter
 from services.estimation.gates import NullGate, SlowOnsetTest, SlowState
 from services.estimation.hypotheses.hypotheses import Hypotheses

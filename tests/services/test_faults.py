@@ -18,8 +18,7 @@ from models.patterns import adjacent, pairs
 from models.shapes import Shape
 from protocol.scan_setting import COHERENT
 from services.estimation.faults.impedance import Change, ContactColumns, Unexplained, gain_change
-from services.estimation.faults.table import BoardScan, WireTable, any_touches
-from services.estimation.faults.wires import WireFault, WireKind, WireMaps
+from services.estimation.faults.wires import BoardScan, WireFault, WireKind, WireMaps, WireTable, any_touches
 from services.runtime.config import ScanMode
 from simulation.faults import CONTACT_RISES, ROWS, FaultRow
 from simulation.host import LATE_S, SimulatedHost, tared

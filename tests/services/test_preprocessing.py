@@ -15,7 +15,7 @@ from models.shapes import Shape
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA, JudgementsFrame, RawFrame, pack, unpack
 from services.describe import EVERY_S, MOVED
 from services.estimation.by_bundle import skin_tables
-from services.estimation.faults import checks
+from services.estimation.faults import advice
 from services.estimation.initialisation.baseline import Baseline, NoBaseline, agreement, take
 from services.estimation.initialisation.start import JudgedStart, StartSays, TouchAtStartTest
 from services.estimation.initialisation.tare import without_drift
@@ -168,7 +168,7 @@ def test_frames_of_another_skin_are_refused_and_short_ones_disturb_nothing(tared
 
 def test_what_a_bundle_cannot_tell_is_said(skin: Skin, bundle: Bundle) -> None:
     """It is no warning."""
-    assert checks.sentence(bundle) == "" and not checks.skipped(bundle)
+    assert advice.unchecked(bundle) == "" and not advice.skipped(bundle)
     found = Bundle.load("disc16")
     measured = Preprocessing("disc", skin.model_copy(update={"bundle": "disc16"}), found)
     measured.set_baseline(Baseline(found.z0, 1e-4 * found.z0, 64, "b1", 0))

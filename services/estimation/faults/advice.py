@@ -1,4 +1,6 @@
-"""What faults of the board are to a frame, states of electrodes and judgements; and to a person, advice."""
+"""What faults of the board are to a frame, states of electrodes and judgements; and to a person, advice. Some cannot be
+told with the measurements of a bundle: those checks are named, so that none looks passed.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +9,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from models.bundle import Bundle
 from protocol.frame_types import ELECTRODE_STATES, STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA
-from services.estimation.faults.wires import WireFault, WireKind
+from services.estimation.faults.wires import WireFault, WireKind, all_pairs
 from services.estimation.values import numbers as n
 from services.estimation.values.judgement import Judgement, Verdict, judge
 
@@ -24,7 +27,7 @@ ADVICE = {
     SWAPPED: "electrodes {}: their wires are exchanged; put them right",
     STUCK: "the multiplexers do not reach electrode {}",
 }
-
+PREDICTED = ("touches at the first start", "drift under a touch", "touches that change during a scan")
 NO_ANSWER = (
     "no electrode answers: the multiplexers are not enabled, nothing is excited (power-cycle the board), or the skin's "
     "cable is off"
@@ -82,6 +85,31 @@ def sentences(states: NDArray[np.uint8], wire: WireFault | None, silent: bool) -
         if named:
             found.append(text.format(_listed(named)) + " (electrodes are numbered from 0)")
     return found
+
+
+def skipped(bundle: Bundle) -> dict[str, str]:
+    """Returns the checks that cannot be made, each with the reason, from the bundle's pattern and normalisation."""
+    pattern = np.asarray(bundle.pattern)
+    own = (pattern[:, 0] == pattern[:, 2]) & (pattern[:, 1] == pattern[:, 3])
+    predicting = [  # check, whether the pattern allows it, what it lacks otherwise
+        ("exchanged wires and stuck multiplexers", all_pairs(pattern), "not all pairs of electrodes are measured"),
+        ("contacts that change", own.all(), "not all pairs sense where they drive"),
+        ("changes that no touch can make", own.sum() >= len(own) / 2, "few pairs sense where they drive"),
+        *((check, True, "") for check in PREDICTED),
+    ]
+    if bundle.matrices.normalisation != "model":
+        predicting = [(check, False, "a measured bundle predicts no impedances") for check, _, _ in predicting]
+    checks = [("shorts between electrodes", own.any(), "no pair senses where it drives"), *predicting]
+    return {check: why for check, made, why in checks if not made}
+
+
+def unchecked(bundle: Bundle) -> str:
+    """Says the same to a person; "" where every check is made."""
+    by_reason: dict[str, list[str]] = {}
+    for check, why in skipped(bundle).items():
+        by_reason.setdefault(why, []).append(check)
+    parts = [f"{', '.join(checks)} ({why})" for why, checks in by_reason.items()]
+    return f"not checked with the bundle {bundle.name}: {'; '.join(parts)}" if parts else ""
 
 
 def _listed(numbers: Iterable[int]) -> str:

@@ -21,8 +21,7 @@ from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VE
 from services.estimation.faults import advice, wires
 from services.estimation.faults.contact_state import ContactState
 from services.estimation.faults.impedance import MOST_LOG, Change, ContactColumns, Unexplained, gain_change, gain_onset
-from services.estimation.faults.table import BoardScan, WireTable
-from services.estimation.faults.wires import WireFault, WireKind, WireMaps
+from services.estimation.faults.wires import BoardScan, WireFault, WireKind, WireMaps, WireTable
 from services.estimation.filter import Prediction
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n

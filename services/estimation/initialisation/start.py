@@ -27,8 +27,7 @@ from models.measurement.covariance.whitening import Whitening, leave_out
 from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
 from models.measurement.responses.tables import SkinTables
 from models.measurement.touch import PLACE, RATE, TouchPrior, anywhere
-from services.estimation.faults.table import BoardScan, WireTable, any_touches
-from services.estimation.faults.wires import WireFault, WireMaps
+from services.estimation.faults.wires import BoardScan, WireFault, WireMaps, WireTable, any_touches
 from services.estimation.values import numbers as n
 from services.estimation.values.judgement import Judgement, Verdict, judge
 
