@@ -213,8 +213,7 @@ class BoardFaults:
         own as for `covariance`.
         """
         now, untouched = self.now, self._wire_scan(view)
-        failed = view.failed & untouched.known
-        scan = replace(untouched, predicted=untouched.predicted + np.log1p(touched), failed=failed)
+        scan = replace(untouched, predicted=untouched.predicted + np.log1p(touched))
         found = self._table.guesses(scan, now.wire, skin + self._any_touch, own)
         best, stands = found[0], next(guess for guess in found if guess.fault == now.wire)
         rival = max(guess.score for guess in found if guess.fault != best.fault)
@@ -235,12 +234,9 @@ class BoardFaults:
 
     def _wire_scan(self, view: BoardView) -> BoardScan:
         """As the wires are asked about it: what open electrodes explain tells nothing of the others' wires."""
-        sound, failed = view.sound + np.log1p(view.mean), view.failed
-        if self.now.wire is None:
-            failed = failed | (np.abs(view.log_z - sound) > np.log(n.FAR))
-        opens = wires.open_electrodes(failed & self._known, self.member)
+        opens = wires.open_electrodes(view.failed, self.member)
         known = self._known & ~self.member[:, list(opens)].any(axis=1)
-        return BoardScan(view.log_z, sound, failed & known, known, view.at.times_s)
+        return BoardScan(view.log_z, view.sound + np.log1p(view.mean), view.failed & known, known, view.at.times_s)
 
     # --- contact impedances and gain ---
 
@@ -538,7 +534,7 @@ class BoardFaults:
         """(E,) of the wire format."""
         now = self.now
         plain = abs(now.size) > n.CONTACT_PLAIN and not now.doubt.beside
-        named = plain or not now.doubt.undecided or now.doubt.seen >= n.NAMED_SCANS
+        named = plain or not now.doubt.undecided or now.doubt.seen >= n.SURE_SCANS
         contact = now.contact if named else -1
         return advice.states_of(len(now.settled), now.wire, now.opens, contact, now.silent)
 
@@ -548,7 +544,7 @@ class BoardFaults:
 
     def gain_gross(self, at_s: float) -> bool:
         """Whether the gain is as no sound board's, and has not lasted."""
-        return self.now.gross_since_s <= at_s < self.now.gross_since_s + n.GAIN_LASTS_S
+        return self.now.gross_since_s <= at_s < self.now.gross_since_s + n.LOST_S
 
     @property
     def sound(self) -> bool:
