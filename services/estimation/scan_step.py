@@ -325,13 +325,13 @@ class ScanStep:
         if cause == MEMORY and measured.whole:
             skin.drift.widen_memories()
             skin.null_gate.forget()
+        odd = cause in (BURST, NOISE)
         if self._complete:
-            odd = cause in (BURST, NOISE)
             skin.noise.hear(weighted_residual, scan.part, odd, measured.middle_s, measured.span_s)
         if not measured.whole:
             return
         self.now.wholes += 1
-        if cause not in (AS_IT_IS, DRIFT, MEMORY):
+        if odd:
             return
         drifts = skin.hypotheses.process_noise_scale if cause == DRIFT else 0.0
         if drifts:

@@ -16,14 +16,7 @@ from scipy.optimize import nnls
 from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anywhere, plain
 from services.estimation.hypotheses.hypotheses import Hypotheses
-from services.estimation.hypotheses.innovation import (
-    Innovation,
-    Priors,
-    ScoredAnswer,
-    begun_as,
-    likeliest,
-    started,
-)
+from services.estimation.hypotheses.innovation import Innovation, Priors, ScoredAnswer, begun_as, likeliest, started
 from services.estimation.overlap import gaps, neighbours
 from services.estimation.track import oddness
 from services.estimation.values import numbers as n
