@@ -83,6 +83,9 @@ class BoardView:
     spread: Array  # (K, n) columns of unit variance of what is not known of it, the changed contact's own first
     contact: int  # electrode whose contact impedance is changed, as far as is known before; -1: none
     apart: bool  # `shown` is without contact impedances that changed
+    opens: tuple[int, ...]  # as in FaultState, of this scan
+    lifted: tuple[int, ...]
+    silent: bool
 
     @property
     def y(self) -> Array:
@@ -162,8 +165,8 @@ class BoardFaults:
 
     # --- what it makes of a scan ---
 
-    def look(self, at: Observation, predicted: Prediction, untouched: Array) -> BoardView:
-        """untouched (K,): log |Z| as the filter predicts it."""
+    def look(self, at: Observation, predicted: Prediction, untouched: Array, lifted: tuple[int, ...]) -> BoardView:
+        """untouched (K,): log |Z| as the filter predicts it; lifted: of open electrodes those that are off the skin."""
         now, values = self.now, at.scan.values
         at_s = at.middle_s + at.times_s
         sound = untouched + np.where(at_s >= now.gain_since_s, now.log_gain, now.log_gain_before)
@@ -173,11 +176,11 @@ class BoardFaults:
         shown, slopes, apart = sound, None, True
         if now.wire is None:
             failed = dead = self._known & (~readable | (np.abs(log_z - sound - np.log1p(mean)) > np.log(n.FAR)))
-            now.silent = bool(failed.mean() >= n.SILENT)
-            now.opens = () if now.silent else wires.open_electrodes(failed, self.member)
-            now.lifted = tuple(k for k in now.lifted if k in now.opens)
-            lifted = self._columns.shunt[:, list(now.lifted)] * n.SHORT_WAY  # (K, n) no electrode shunts the sheet
-            mean, spread = mean + lifted.sum(axis=1), np.hstack([spread, n.SHORT_WAY_SD * lifted])
+            silent = bool(failed.mean() >= n.SILENT)
+            opens = () if silent else wires.open_electrodes(failed, self.member)
+            lifted = tuple(k for k in lifted if k in opens)
+            unshunted = self._columns.shunt[:, list(lifted)] * n.SHORT_WAY  # (K, n) no electrode shunts the sheet
+            mean, spread = mean + unshunted.sum(axis=1), np.hstack([spread, n.SHORT_WAY_SD * unshunted])
         else:
             apart = self.exchanged  # each measurement is another's then, its contacts as well
             found = self.maps.one(now.wire, np.exp(sound if apart else sound + np.log1p(mean)))
@@ -185,12 +188,15 @@ class BoardFaults:
             shown, slopes = np.log(np.maximum(found.values, n.TINY)), found.slopes
             if apart:
                 mean, spread = found.slopes @ mean, found.slopes @ spread
-            now.opens, now.lifted, now.silent = (), (), False  # what fails is left out: a wire that is wrong may be why
+            opens, lifted, silent = (), (), False  # what fails is left out: a wire that is wrong may be why
         dead = dead | (at_s < now.wire_since_s)  # measured by wires that were otherwise
-        live = self._known & ~dead & ~self.member[:, list(now.opens)].any(axis=1)
-        return BoardView(
-            at, predicted, untouched, log_z, sound, failed, live, shown, slopes, mean, spread, now.contact, apart
-        )
+        live = self._known & ~dead & ~self.member[:, list(opens)].any(axis=1)
+        showing = log_z, sound, failed, live, shown, slopes, mean, spread, now.contact, apart
+        return BoardView(at, predicted, untouched, *showing, opens, lifted, silent)
+
+    def take_over(self, view: BoardView) -> None:
+        """Which electrodes answer, by the view that explains a scan."""
+        self.now.opens, self.now.lifted, self.now.silent = view.opens, view.lifted, view.silent
 
     def _contacts(self, at_s: Array, course: Array) -> tuple[Array, Array]:
         now, columns = self.now, self.columns

@@ -42,23 +42,24 @@ class FaultIsolation:
         """selection: of what touches may do."""
         faults, before = self._faults, (self._faults.now.wire, self._faults.now.wire_since_s)
         standing = self._touches.expected(self._at)
-        view = self._look()
+        view = self._look(faults.now.lifted)
         if faults.now.wire is None and self._rewired(view, standing):
-            view = self._look()
+            view = self._look(view.lifted)
         found = self._asked(selection, view)
         odd = _doubtful(found.answer) or -1 in found.answer.association
         if faults.now.wire is not None and odd and self._rewired(view, standing):
-            found = self._asked(selection, self._look())
-        if faults.now.opens and faults.now.wire is None and (odd or (self._at.whole and self._touches.in_doubt)):
+            found = self._asked(selection, self._look(view.lifted))
+        if found.view.opens and faults.now.wire is None and (odd or (self._at.whole and self._touches.in_doubt)):
             found = self._lifted(found, selection)
+        faults.take_over(found.view)
         if faults.asks(found.answer):
             found = self._faulty(found, selection, standing)
         if not found.answer.nearly_holds:  # what does not explain its scan would stand beside any touch in the next one
             faults.now.wire, faults.now.wire_since_s = before
         return self._doubted(found)
 
-    def _look(self) -> BoardView:
-        return self._faults.look(self._at, self._predicted, self._skin.log_z0 + self._predicted.shift)
+    def _look(self, lifted: tuple[int, ...]) -> BoardView:
+        return self._faults.look(self._at, self._predicted, self._skin.log_z0 + self._predicted.shift, lifted)
 
     def _rewired(self, view: BoardView, standing: Sequence[TouchPrior]) -> bool:
         if not self._faults.suspects_wires(view):
@@ -77,14 +78,10 @@ class FaultIsolation:
         """Electrodes that are open may be off the skin, or on it and cut off: whichever explains the scan better. A
         touch that has just come is not known well enough to decide by little: the scans that follow ask again.
         """
-        now = self._faults.now
-        before, now.lifted = now.lifted, () if now.lifted else now.opens
-        other = self._asked(selection, self._look())
+        other = self._asked(selection, self._look(() if found.view.lifted else found.view.opens))
         sure = n.WIRE_SURE if -1 in found.answer.association else n.FAULT_SURE
-        if (other.answer.holds, other.answer.score) > (found.answer.holds, found.answer.score + sure):
-            return other
-        now.lifted = before
-        return found
+        better = (other.answer.holds, other.answer.score) > (found.answer.holds, found.answer.score + sure)
+        return other if better else found
 
     def _faulty(
         self, found: Explanation, selection: HypothesisSelection, standing: Sequence[TouchPrior]
