@@ -157,9 +157,7 @@ class ScanStep:
             return None
         innovation = Innovation(*measured.fields, self._y, known.covariance, information.each)
         expected = skin.touches.expected(measured)
-        answer = skin.hypotheses.fitted(
-            innovation, expected, most_steps=n.STEPS_HELD, known=known.white, turned=known.turned
-        )
+        answer = skin.hypotheses.fitted(innovation, expected, most_steps=1, known=known.white, turned=known.turned)
         return (innovation, answer) if answer.explained and answer.next_touch_z2 < n.GLANCE_Z2 else None
 
     # --- answers ---

@@ -53,8 +53,7 @@ from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 
-ON_ELECTRODE = ((0.03, 0.0), (0.03, 0.1), (0.03, -0.1))  # inside its edge and along it, where a search begins
-SMALL_RADIUS = 0.1  # where it begins
+INSIDE, SMALL_RADIUS = 0.03, 0.1  # of an electrode's edge, and of a touch on it, where a search begins [unit]
 RAMPS_S = (AT_ONCE_S, float(SUDDEN_STEPS[-1]), 2 * float(SUDDEN_STEPS[-1]))  # of a touch that ends within a scan
 CAUSE_STEPS = 1  # that touches which are known need beside another cause
 WIDER = (MEMORY, DRIFT, BURST, NOISE)
@@ -193,8 +192,8 @@ class Hypotheses:
         out = place / max(float(np.hypot(*place)), LEAST_ACTION)
         found = list[ScoredAnswer]()
         action = 0.0  # of the likeliest so far
-        for inside, along in ON_ELECTRODE:
-            x, y = place - inside * out + along * np.array([-out[1], out[0]])
+        for along in (0.0, SMALL_RADIUS, -SMALL_RADIUS):
+            x, y = place - INSIDE * out + along * np.array([-out[1], out[0]])
             prior = anywhere(float(x), float(y), 0.0, innovation.span_s)
             prior.start[LOG_RADIUS] = np.log(SMALL_RADIUS)
             more = action**2 * second

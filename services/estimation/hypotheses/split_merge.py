@@ -23,7 +23,7 @@ from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 
-HALVED_ANGLES = np.arange(8) * np.pi / 8  # along which two discs are tried instead of one
+HALVED_ANGLES = np.linspace(0, np.pi, 8, endpoint=False)  # along which two discs are tried instead of one
 HALVED_APART = (0.6, 1.0, 1.4)  # how far each lies from its middle, in radii
 
 

@@ -89,7 +89,6 @@ LEAST_BUDGET = Number(0.4, "-", "of them, for a part of a scan", "chosen: the pa
 SEPARATE = Number(4.0, "-", "times that, of a scan that stands by itself", "chosen: four scans find any three touches")
 FOR_FAULTS = Number(0.4, "-", "of them, for what the board may have done", "derived: two changes, two fits each")
 STEPS_WARM = Number(4.0, "-", "steps of a fit from the scan before", "measured: 2 or 3 are used")
-STEPS_HELD = Number(1.0, "-", "the same of touches that stay as they are", "measured: seldom one is needed")
 STEPS_COLD = Number(10.0, "-", "steps of a fit from a grid's disc", "measured: 4 to 10 are used")
 ADRIFT = Number(1.5, "-", "by which faster drift grows with each unexplained scan", "derived: 2 s to a per cent")
 MOST_ADRIFT = Number(1e4, "-", "at most, of its variance", "derived: ten per cent of the field")
