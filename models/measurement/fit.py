@@ -105,12 +105,8 @@ class FoundTouches:
     def __len__(self) -> int:
         return len(self.priors)
 
-    def information(self, response: Array) -> float:
-        """Of a further touch of this response (K,), touches fitted: 1 / variance of its strength."""
-        return float(self.informations(response[:, None])[0])
-
     def informations(self, responses: Array) -> Array:
-        """(n,) of each of these responses (K, n) alone."""
+        """(n,) of one further touch of each response (K, n), touches fitted: 1 / variance of its strength."""
         columns = self.white(responses)
         along = self.design.T @ columns
         whole = np.sum(columns**2, axis=0)

@@ -166,7 +166,7 @@ def test_a_fit_that_is_linear_has_the_posterior_and_the_evidence_of_linear_algeb
     assert_allclose(found.weighted_residual, inverse @ left, atol=0.02 * np.abs(inverse @ left).max())
     other = Hills()(-0.3, 0.4, -1.5)
     without = inverse - inverse @ design @ posterior @ design.T @ inverse
-    assert found.information(other) == pytest.approx(other @ without @ other, rel=0.02)
+    assert found.informations(other[:, None])[0] == pytest.approx(other @ without @ other, rel=0.02)
     assert found.informations(design[:, 3:4])[0] >= 0.02 * design[:, 3] @ inverse @ design[:, 3] * 0.99
 
 

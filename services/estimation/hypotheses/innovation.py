@@ -169,13 +169,13 @@ class ScoredAnswer:
 
     def information(self, column: Array) -> float:
         """Of what else may add to the scan by this column (K,): 1 / variance of its size."""
-        return float(np.sum(self.white(column) ** 2)) if self.fit is None else self.fit.information(column)
+        return float(self.informations(column[:, None])[0])
 
     def informations(self, columns: Array) -> Array:
         """(n,) of each of these columns (K, n) alone."""
-        return (
-            np.asarray(np.sum(self.white(columns) ** 2, axis=0)) if self.fit is None else self.fit.informations(columns)
-        )
+        if self.fit is not None:
+            return self.fit.informations(columns)
+        return np.asarray(np.sum(self.white(columns) ** 2, axis=0))
 
 
 def started(fit: FoundTouches | None, priors: Priors | None = None) -> list[TouchPrior]:
