@@ -26,7 +26,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 23  # of a kept state
+LAYOUT = 24  # of a kept state
 
 
 @dataclass

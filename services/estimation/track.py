@@ -64,6 +64,7 @@ class TrackedTouch:
     turned_s: float = np.inf  # when how strongly it acts changed at once
     scans: int = 0  # that it was fitted to and that share no value
     still: int = 0  # of them, in a row: it neither moved nor changed
+    since_step: int = 0  # whole scans since it was elsewhere or otherwise at once
     moves: bool = False
     z2: float = 0.0  # how much it explains: squared sigmas of its action, in the middle of the scan or at its end
     confirmed: bool = False
@@ -86,8 +87,10 @@ class TrackedTouch:
 
     @property
     def contact_due(self) -> bool:
-        """Whether it is time to ask if it is an electrode's contact impedance: while it is new, and now and then."""
-        return 0 < self.scans <= n.SURE_SCANS or self.doubt_due
+        """Whether it is time to ask if it is an electrode's contact impedance: while it is new or was otherwise of
+        late, and now and then.
+        """
+        return (self.scans > 0 and self.since_step <= n.SURE_SCANS) or self.doubt_due
 
     @property
     def weakened(self) -> bool:
@@ -169,6 +172,8 @@ class TrackedTouch:
         own, span_s, whole = slice(STATES * k, STATES * (k + 1)), measured.span_s, measured.whole
         state, covariance = fit.states[k], fit.covariance[own, own]
         self.jumped = not (self.lost or self.ended) and distance(self.state, state) > max(n.SAME_TOUCH, self.radius)
+        steps = whole and self._steps_to(state, covariance, measured.middle_s)
+        self.since_step = 0 if steps else self.since_step + whole
         self.state, self.covariance, self.at_s, self.lost = state, covariance, measured.middle_s, False
         self.z2 = max((max(action, 0.0) / sd) ** 2 for action, sd in map(self._action, (0.0, span_s / 2)))
         if self.ended:
@@ -186,6 +191,15 @@ class TrackedTouch:
         before, self.surely = self.surely, float(state[ACTION] - 2 * sd[ACTION])
         # The few new values of one part may be explained by any touch, also where none is the reason.
         self.peak = max(self.peak, self.surely if whole else min(before, self.surely))
+
+    def _steps_to(self, state: Array, covariance: Array, at_s: float) -> bool:
+        """Whether a state is not what it came to by its motion: something may have ended there, or begun."""
+        passed_s = at_s - self.at_s
+        way = state[PLACE] - self.state[PLACE] - self.state[VELOCITY] * passed_s
+        change = state[ACTION] - self.state[ACTION] - self.state[RATE] * passed_s
+        sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        far = np.hypot(*way) > max(n.STILL_WAY, 3 * float(np.hypot(*sd[PLACE])))
+        return bool(far or abs(change) > max(n.STILL_CHANGE * abs(self.state[ACTION]), 3 * sd[ACTION]))
 
     def learn(self, fit: FoundTouches, k: int) -> None:
         """Radius and outline, of a scan that shares no value with the one before."""

@@ -173,6 +173,14 @@ def test_a_contact_that_drifts_is_named_all_the_while_and_not_long_after(skin: S
 # touches
 
 
+def test_a_contact_that_changes_in_the_scan_in_which_another_goes_back_leaves_neither_named(skin: StubSkin) -> None:
+    (sound, status), (changed, _) = skin.measured(transfer()), skin.measured(transfer((), ((0, 0.7),)))
+    skin.felt(3)
+    skin.run(np.concatenate([sound[:60], changed[60:]]), status)
+    skin.felt(1, (), ((9, 0.7),))
+    assert well(skin.felt(20)[5:])
+
+
 def test_after_lost_scans_a_frame_that_nothing_explains_names_the_gap(skin: StubSkin) -> None:
     skin.felt(8, PRESS)
     skin.scan += 20
@@ -250,7 +258,7 @@ def test_what_a_contact_that_drifted_under_a_light_touch_leaves_is_no_touch(skin
     held = [skin.feel((touch,), (contact,)) for contact in risen[:90]]
     after = [skin.feel((), (contact,)) for contact in risen[90:]]
     assert all(len(present(r)) == 1 for r in held[-40:])
-    assert not any(r.contact.valid and present(r) for r in after[10:])
+    assert not any(r.contact.valid and present(r) for r in after[3:])
     assert all(states(r) == {"drifting": [electrode]} for r in after[-20:])
 
 

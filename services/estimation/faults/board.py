@@ -286,7 +286,7 @@ class BoardFaults:
         if best is None:
             return None
         change, column, asked, found = best
-        self._adopt(view, change, float(column @ found.weighted_residual))
+        self._adopt(view, change, float(column @ found.weighted_residual), found)
         if not change.is_gain:
             self.now.doubt.beside = self._beside(change, found)
         return Explanation(view, asked, found, changed=True)
@@ -412,8 +412,8 @@ class BoardFaults:
                 return False
         return True
 
-    def _adopt(self, view: BoardView, change: Change, sigmas: float) -> None:
-        """sigmas: of its prior, by which it is off."""
+    def _adopt(self, view: BoardView, change: Change, sigmas: float, found: ScoredAnswer) -> None:
+        """sigmas: of its prior, by which it is off; found: the answer with it, and with what stood."""
         now, since_s = self.now, view.at.middle_s + change.since_s
         if change.is_gain:
             now.log_gain_before, now.gain_since_s = now.log_gain, since_s
@@ -423,8 +423,12 @@ class BoardFaults:
             self._note_gross(max(since_s, view.at.oldest_s))
             return
         before = now.size if change.electrode == now.contact else 0.0
-        if now.contact not in (-1, change.electrode) and not now.doubt.undecided:
-            self._settle()
+        if now.contact not in (-1, change.electrode):
+            self._update_size(view, found)
+            if self._at_home:
+                now.size = self._home
+            if self._at_home or not (now.doubt.undecided or self.began_within(view)):  # else no scan confirmed it
+                self._settle()
         if now.contact != change.electrode:
             now.doubt = ContactState()
         now.contact, now.contact_since_s, now.size_before = change.electrode, since_s, before
@@ -462,22 +466,21 @@ class BoardFaults:
             return
         self._update_size(view, answer)
         sd = float(np.sqrt(now.variance))
-        unsure = n.CONTACT_BACK + 3 * sd
-        if whole and abs(now.size) < unsure and now.doubt.falls(now.size):  # a touch took it over, or it is well
+        if whole and abs(now.size) < self._unsure and now.doubt.falls(now.size):  # a touch took it over, or it is well
             self.drop_contact()
             return
-        home = min(0.0, -float(now.settled[now.contact]), key=lambda size: abs(now.size - size))  # where it is well
+        home = self._home
         if whole:
             now.doubt.follow(view.at.middle_s, now.size, sd, home)
         self._time_still(passed_s)
-        now.back_scans = (now.back_scans + whole) if abs(now.size - home) < unsure else 0
+        now.back_scans = (now.back_scans + whole) if self._at_home else 0
         now.variance += (n.CONTACT_WALK_CHANGED * self._impedance) ** 2 * min(passed_s / SCAN_S, 1.0)
         drifts = view.at.middle_s < now.doubt.drifts_until_s
         settles_s = n.UNDECIDED_SETTLES_S if now.doubt.undecided else n.CONTACT_SETTLES_S
-        back = now.back_scans >= n.BACK_SCANS
+        back = now.back_scans >= n.BACK_SCANS or now.doubt.stays(home)
         if not drifts and (back or now.still_s > settles_s):
             # One scan's size is off by its noise, and nothing would take that back.
-            now.size = home if back or now.doubt.stays(home) else now.doubt.lately(view.at.middle_s)
+            now.size = home if back else now.doubt.lately(view.at.middle_s)
             self._settle()
 
     def remember(self, residual: Array, whole: bool) -> None:
@@ -513,6 +516,20 @@ class BoardFaults:
             column, sd = view.spread[:, 0], float(np.sqrt(now.variance))
             now.size = max(now.size + sd * float(column @ answer.weighted_residual), self._least_size)
             now.variance *= max(1 - answer.information(column), 1e-4)
+
+    @property
+    def _unsure(self) -> float:
+        """By how much its size may be off."""
+        return float(n.CONTACT_BACK + 3 * np.sqrt(self.now.variance))
+
+    @property
+    def _home(self) -> float:
+        """The size nearest to its own with which it is well: as the skin has it, or as it was at the tare."""
+        return min(0.0, -float(self.now.settled[self.now.contact]), key=lambda size: abs(self.now.size - size))
+
+    @property
+    def _at_home(self) -> bool:
+        return abs(self.now.size - self._home) < self._unsure
 
     @property
     def _impedance(self) -> float:
