@@ -14,9 +14,9 @@ import numpy as np
 from models.bundle import Bundle
 from models.fisher import MeasurementNoise, SizePrior, floors, mean_floor
 from models.forward import shared
-from models.measurement.covariance.whitening import Whitening
 from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START
-from models.measurement.responses.tables import tables_of
+from models.measurement.tables import tables_of
+from models.measurement.whitening import Whitening
 from models.pressure import FOAM, disc
 from models.shapes import Array, Shape
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.force_limits import places
-from models.measurement.responses.disc import DiscResponse
-from models.measurement.responses.tables import tables_of
+from models.measurement.tables import DiscResponse, tables_of
 from models.measurement.touch import area_of
 from models.pressure import FOAM, disc
 from models.rolling import most_parts, order

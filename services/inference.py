@@ -1,6 +1,6 @@
 """Inference: from the difference to the image of the conductivity drop, by the bundle's network.
 
-difference -> stack of pre-reconstructions (services/estimation/images/reconstruct.py), a topic too -> image
+difference -> stack of pre-reconstructions (services/estimation/images.py), a topic too -> image
 ONNX Runtime on one thread, warmed up before the stage is ready. A bundle without a network gives the one-step image.
 """
 
@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.locator import Located, Locator
-from models.measurement.responses.tables import tells_touches
+from models.measurement.tables import tells_touches
 from models.prereconstruction import Operator
 from models.symmetries import symmetries
 from protocol.frames import DeltaFrame, Frame, ImageFrame, LocatedTouch, StackFrame
 from services.describe import ON, symmetry
-from services.estimation.images.quality import Residual
-from services.estimation.images.reconstruct import MEANS, Operators, sigma_of_mean
+from services.estimation.images import MEANS, Operators, Residual, sigma_of_mean
 from services.linearisation import Linearisation
 from services.networks import Network, OneStep, Pictures, Stack, network, nothing
 from services.runtime.config import Skin

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 
 from protocol.frames import DeltaFrame, JudgementsFrame
-from services.estimation.values.judgement import Judgement
+from services.estimation.values.estimate import Judgement
 from services.runtime.stage import inherited
 
 MOST = 1e300  # what stands for more, and for no number: a verdict turns at both

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.calibration_file import CalibrationFileError, unpack
 from models.files import FileError, read_bytes
-from models.measurement.responses.tables import SkinTables
+from models.measurement.tables import SkinTables, skin_tables
 from protocol.errors import in_words
-from services.estimation.by_bundle import skin_tables
 from services.estimation.initialisation.baseline import Baseline, implausibility
 from services.runtime import persistence
 from services.runtime.config import ROOT

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle, BundleError, read_network
 from models.prereconstruction import Operator
 from protocol.frames import DeltaFrame
-from services.estimation.images.reconstruct import FEWEST
+from services.estimation.images import FEWEST
 
 WARM_UP_RUNS = 5
 INPUTS, OUTPUTS = ("stack", "context"), ("drop", "log_sigma", "classes")

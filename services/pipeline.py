@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from models.bundle import Bundle
 from protocol.frames import ContactFrame, DeltaFrame, Frame, ImageFrame, RawFrame
-from services.estimation.values.judgement import Judgement
+from services.estimation.values.estimate import Judgement
 from services.inference import Inference
 from services.preprocessing import Preprocessing
 from services.publisher import Publishing

@@ -15,18 +15,17 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.calibration_file import found_by
+from models.measurement.tables import skin_tables
 from protocol.frames import DeltaFrame, EstimatedTouch, Frame, PartFrame, RawFrame, as_sent
 from services.contacts.lasting import LASTS_NS
 from services.describe import BaselineNews, FrameRate, describe, force, symmetry
-from services.estimation.by_bundle import skin_tables
 from services.estimation.estimator import LAYOUT, Estimator
 from services.estimation.faults.advice import sentences, unchecked
-from services.estimation.images.reconstruct import Operators, Reconstructed, Reconstruction, sigma_of_mean
+from services.estimation.images import Operators, Reconstructed, Reconstruction, sigma_of_mean
 from services.estimation.initialisation.baseline import TAKING, Baseline, NoBaseline, plausible_noise
 from services.estimation.initialisation.references import References
 from services.estimation.tared import KnownBaseline
-from services.estimation.values.estimate import Estimate, TouchEstimate
-from services.estimation.values.judgement import Judgement
+from services.estimation.values.estimate import Estimate, Judgement, TouchEstimate
 from services.estimation.values.scan import Scan
 from services.judged import judged
 from services.linearisation import Linearisation

@@ -15,7 +15,7 @@ import numpy as np
 
 from models.bundle import Bundle
 from models.locator_arrays import QUANTITIES
-from models.measurement.responses.tables import tells_touches
+from models.measurement.tables import tells_touches
 from protocol.frames import (
     SHAPES,
     Contact,

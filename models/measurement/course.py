@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement import numbers as n
-from models.measurement.responses.response import TouchModel
+from models.measurement.response import TouchModel
 from models.measurement.touch import ACTION, AT_ONCE_S, LOG_RADIUS, RATE, SHAPES, STATES, VX, VY, TouchPrior, X, Y
 
 Array = NDArray[np.float64]

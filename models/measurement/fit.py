@@ -16,7 +16,6 @@ from scipy.linalg import lapack
 
 from models.measurement import numbers as n
 from models.measurement.course import STRENGTH, Kinks, TouchColumns, TouchCourse
-from models.measurement.covariance.whitening import Whitening, diagonal_of, factor
 from models.measurement.touch import (
     ACTION,
     LOG_RADIUS,
@@ -33,6 +32,7 @@ from models.measurement.touch import (
     is_disc,
     within_limits,
 )
+from models.measurement.whitening import Whitening, diagonal_of, factor
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from models import rolling
 from models.bundle import Bundle
-from services.estimation.by_bundle import ByBundle
+from models.measurement.tables import ByBundle
 
 KEPT = 64  # orders, of a kilobyte each
 

@@ -13,7 +13,7 @@ from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field, replace
 
 from models.bundle import Bundle
-from models.measurement.responses.tables import tells_touches
+from models.measurement.tables import tells_touches
 from protocol import link
 from protocol.frames import RawFrame
 from protocol.part_size import parts_on_line

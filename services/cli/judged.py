@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 
 from protocol.frames import JudgementsFrame
 from protocol.sockets import AllReader
-from services.estimation.values.judgement import ROWS, CheckRow, Judgement, Verdict
+from services.estimation.values.estimate import ROWS, CheckRow, Judgement, Verdict
 from services.judged import MOST
 
 ORDER = (Verdict.REFUSE, Verdict.NOTE, Verdict.PASS, Verdict.CANNOT, Verdict.NOT_ASKED)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.responses.tables import SkinTables
+from models.measurement.tables import SkinTables
 from models.measurement.touch import SHAPES, STATES
 from services.estimation.faults import advice
 from services.estimation.faults.wires import WireFault
@@ -19,8 +19,7 @@ from services.estimation.initialisation.tare import AgreedScans, BaselineTells, 
 from services.estimation.scan_step import EstimatorState, ScanStep
 from services.estimation.tared import KnownBaseline, TaredSkin, TaredState
 from services.estimation.values import numbers as n
-from services.estimation.values.estimate import Estimate
-from services.estimation.values.judgement import Judgement, judge
+from services.estimation.values.estimate import Estimate, Judgement, judge
 from services.estimation.values.scan import Scan
 from services.estimation.values.state import loaded, saved
 

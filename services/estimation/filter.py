@@ -12,10 +12,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FoundTouches
 from models.measurement.numbers import LEARNING
-from models.measurement.responses.tables import FIELD_DEGREES, SkinTables
+from models.measurement.tables import FIELD_DEGREES, SkinTables
+from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]

@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.noise import BURST_BLOCK, NoiseModel
-from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import KnownWhitening, Turned
-from models.measurement.responses.response import DiscGrid
+from models.measurement.noise import BURST_BLOCK, NoiseModel
+from models.measurement.response import DiscGrid
+from models.measurement.whitening import Whitening
 from services.estimation.filter import FilterState, SkinFilter
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.whitening import Whitening, leave_out
 from models.measurement.touch import ACTION, STATES
-from services.estimation.delayed_update import PendingScan
+from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice
 from services.estimation.faults.board import Explanation
 from services.estimation.faults.isolation import FaultIsolation
@@ -29,12 +28,12 @@ from services.estimation.hypotheses.innovation import (
 )
 from services.estimation.hypotheses.selection import HypothesisSelection
 from services.estimation.initialisation.tare import Taring
+from services.estimation.learning import PendingScan
 from services.estimation.tared import KnownBaseline, TaredSkin
 from services.estimation.track import coasted
 from services.estimation.track_update import update_tracks
 from services.estimation.values import numbers as n
-from services.estimation.values.estimate import Estimate, TouchEstimate
-from services.estimation.values.judgement import Judgement, Verdict, judge
+from services.estimation.values.estimate import Estimate, Judgement, TouchEstimate, Verdict, judge
 from services.estimation.values.scan import Scan
 
 Array = NDArray[np.float64]

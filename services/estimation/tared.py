@@ -9,11 +9,9 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.lines import LineState
-from models.measurement.covariance.noise import NoiseModel, NoiseState
-from models.measurement.covariance.whitening import leave_out
-from models.measurement.responses.tables import SkinTables
-from services.estimation.delayed_update import DelayedUpdate, LearningState
+from models.measurement.noise import LineState, NoiseModel, NoiseState
+from models.measurement.tables import SkinTables
+from models.measurement.whitening import leave_out
 from services.estimation.faults.board import BoardFaults, FaultState
 from services.estimation.faults.wires import WireFault, any_touches
 from services.estimation.filter import MODES, STATES_OF_MEMORY, FilterState, Memory, SkinFilter
@@ -21,8 +19,8 @@ from services.estimation.gates import NullGate, SlowOnsetTest, SlowState
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.initialisation.start import EarlierBaseline
 from services.estimation.initialisation.tare import AgreedScans
+from services.estimation.learning import DelayedUpdate, LearningState, RefusedState, UnexplainedLoad
 from services.estimation.touches import TouchesState, TouchTracks
-from services.estimation.unexplained_load import RefusedState, UnexplainedLoad
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]

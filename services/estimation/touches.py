@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from models.measurement.course import SUDDEN_REACH_S
 from models.measurement.fit import FoundTouches
-from models.measurement.responses.response import TouchModel
+from models.measurement.response import TouchModel
 from models.measurement.touch import ACTION, LOG_RADIUS, RATE, SHAPE_SDS, STATES, TouchPrior, X, Y, is_anywhere
 from services.estimation.filter import Memory
 from services.estimation.hypotheses.innovation import Observation

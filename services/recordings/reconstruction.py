@@ -25,7 +25,7 @@ from services.estimation.initialisation.baseline import (
     unlike,
 )
 from services.estimation.values import numbers
-from services.estimation.values.judgement import Judgement, Verdict
+from services.estimation.values.estimate import Judgement, Verdict
 from services.mounting import MountingFit, needs_fit
 from services.pipeline import ALL, Pipeline, Result
 from services.recordings.npz_file import TARE_ROWS, UNIT_UNKNOWN, Input, frames_of

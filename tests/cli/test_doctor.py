@@ -25,7 +25,7 @@ from services.cli.doctor_live import Finding, validity
 from services.cli.doctor_mounting import mounting_found
 from services.cli.judged import turned
 from services.estimation.initialisation.baseline import TAKING
-from services.estimation.values.judgement import judge
+from services.estimation.values.estimate import judge
 from services.judged import judged
 from services.runtime.config import Skin
 

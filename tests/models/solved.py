@@ -8,7 +8,7 @@ from firmware_stub.sheet import Sheet
 from firmware_stub.world import Touch, World
 from firmware_stub.worlds import table
 from models.bundle import Bundle
-from models.measurement.responses.tables import SkinTables, tables_of
+from models.measurement.tables import SkinTables, tables_of
 
 UNIT_M = 0.05
 

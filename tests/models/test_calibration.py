@@ -13,8 +13,7 @@ from models.calibration_file import CalibrationFileError, pack, unpack
 from models.measurement.course import TouchCourse
 from models.measurement.fit import FittedScan, TouchFitter
 from models.measurement.numbers import MISFIT, MISFIT_FAR
-from models.measurement.responses.disc import DiscResponse
-from models.measurement.responses.tables import SkinTables, tables_of
+from models.measurement.tables import DiscResponse, SkinTables, tables_of
 from models.measurement.touch import anywhere, plain
 from models.mismatch import Mismatch, MismatchedSheet, mounted, named
 from models.mounted import FieldModes, Mounting, Predicted, most_shift

@@ -10,14 +10,12 @@ from scipy.ndimage import gaussian_filter
 from firmware_stub.world import pressed
 from models.bundle import Bundle
 from models.locator_arrays import LocatorArrays
-from models.measurement.covariance.lines import ELSEWHERE, Lines
-from models.measurement.covariance.noise import NoiseModel, in_blocks
-from models.measurement.covariance.whitening import Whitening, leave_out
+from models.measurement.noise import ELSEWHERE, Lines, NoiseModel, in_blocks
 from models.measurement.numbers import EDGE_WIDTH, MISFIT, TYPICAL_RADIUS
-from models.measurement.responses.disc import DiscResponse
-from models.measurement.responses.measured_map import MeasuredMap
-from models.measurement.responses.tables import FIELD_MODES, tables_of
+from models.measurement.response import MeasuredMap
+from models.measurement.tables import FIELD_MODES, DiscResponse, tables_of
 from models.measurement.touch import EDGE, X, Y
+from models.measurement.whitening import Whitening, leave_out
 from tests.models.solved import action_of, change, log_change, sheet, tables, untouched
 
 

@@ -13,13 +13,12 @@ from models.forward import ForwardModel
 from models.linearise import linearise
 from models.measurement import touch as touches
 from models.measurement.course import TouchCourse
-from models.measurement.covariance.noise import NoiseModel
-from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FittedScan, TouchFitter
-from models.measurement.responses.disc import DiscResponse
-from models.measurement.responses.response import DiscGrid
-from models.measurement.responses.tables import SkinTables, tables_of
+from models.measurement.noise import NoiseModel
+from models.measurement.response import DiscGrid
+from models.measurement.tables import DiscResponse, SkinTables, tables_of
 from models.measurement.touch import ACTION, PLACE, RATE, VX, TouchPrior, X, Y, anywhere, plain
+from models.measurement.whitening import Whitening
 from models.response_tables import response_tables
 from models.shapes import Shape
 

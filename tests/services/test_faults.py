@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from firmware_stub.analog import Analog, BoardNoise
 from firmware_stub.faults import FAULTS, MUXES, Faults
-from models.measurement.covariance.whitening import Whitening
-from models.measurement.responses.disc import DiscResponse
-from models.measurement.responses.response import DiscGrid
-from models.measurement.responses.tables import SkinTables, tables_of
+from models.measurement.response import DiscGrid
+from models.measurement.tables import DiscResponse, SkinTables, tables_of
+from models.measurement.whitening import Whitening
 from models.patterns import adjacent, pairs
 from models.shapes import Shape
 from protocol.scan_setting import COHERENT

@@ -6,10 +6,9 @@ import pytest
 from models.shapes import Shape, drop_image
 from protocol.frame_types import REASONS, VERDICTS
 from protocol.frames import STATUS_OPEN, DeltaFrame, JudgementsFrame, PartFrame, RawFrame, pack, unpack
-from services.estimation.images.quality import Residual
+from services.estimation.images import Residual
 from services.estimation.track import coasted
-from services.estimation.values.estimate import TouchEstimate
-from services.estimation.values.judgement import ROWS, Verdict, judge, reasons, valid
+from services.estimation.values.estimate import ROWS, TouchEstimate, Verdict, judge, reasons, valid
 from services.estimation.values.scan import Scan
 from services.inference import Inference
 from services.judged import judged

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.forward import shared
-from models.measurement.responses.tables import tables_of
+from models.measurement.tables import skin_tables, tables_of
 from models.mismatch import MismatchedSheet, named
 from models.shapes import Shape
 from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA, JudgementsFrame, RawFrame, pack, unpack
 from services.describe import EVERY_S, MOVED
-from services.estimation.by_bundle import skin_tables
 from services.estimation.faults import advice
 from services.estimation.initialisation.baseline import Baseline, NoBaseline, agreement, take
 from services.estimation.initialisation.start import JudgedStart, StartSays, TouchAtStartTest

@@ -13,7 +13,7 @@ from models.bundle import Bundle
 from protocol.frame_types import ELECTRODE_STATES, STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA
 from services.estimation.faults.wires import WireFault, WireKind, all_pairs
 from services.estimation.values import numbers as n
-from services.estimation.values.judgement import Judgement, Verdict, judge
+from services.estimation.values.estimate import Judgement, Verdict, judge
 
 OK, OPEN, SHORT, UNKNOWN, DRIFTING, SWAPPED, STUCK = range(len(ELECTRODE_STATES))
 STATE_OF = {WireKind.EXCHANGED: SWAPPED, WireKind.SHORT: SHORT, WireKind.STUCK: STUCK}

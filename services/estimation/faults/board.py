@@ -14,10 +14,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.whitening import Whitening, leave_out
 from models.measurement.fit import FoundTouches
-from models.measurement.responses.tables import SkinTables
+from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
+from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice, wires
 from services.estimation.faults.contact_state import ContactState
 from services.estimation.faults.impedance import MOST_LOG, Change, ContactColumns, Unexplained, gain_change, gain_onset

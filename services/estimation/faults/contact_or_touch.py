@@ -13,10 +13,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.whitening import leave_out
 from models.measurement.fit import FoundTouches
-from models.measurement.responses.tables import SkinTables
+from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION
+from models.measurement.whitening import leave_out
 from services.estimation.faults.board import LEAST, BoardFaults, BoardView, Explanation
 from services.estimation.faults.impedance import Change, Unexplained
 from services.estimation.hypotheses.hypotheses import Hypotheses

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import LEAST_MEAN
-from models.measurement.responses.tables import SkinTables
+from models.measurement.tables import SkinTables
+from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]

@@ -21,10 +21,10 @@ from itertools import combinations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.whitening import Whitening
 from models.measurement.numbers import TYPICAL_DROP
-from models.measurement.responses.response import DiscGrid
+from models.measurement.response import DiscGrid
 from models.measurement.touch import area_of
+from models.measurement.whitening import Whitening
 from services.estimation.faults.impedance import MOST_LOG
 from services.estimation.values import numbers as n
 

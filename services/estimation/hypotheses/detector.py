@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.noise import BURST_BLOCK
-from models.measurement.covariance.whitening import Whitening
-from models.measurement.responses.response import DiscGrid
+from models.measurement.noise import BURST_BLOCK
+from models.measurement.response import DiscGrid
+from models.measurement.whitening import Whitening
 from services.estimation.hypotheses.innovation import ONSETS, Innovation, ScoredAnswer
 from services.estimation.values import numbers as n
 

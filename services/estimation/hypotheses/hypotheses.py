@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.course import SUDDEN_STEPS, TURN_STEPS, TouchCourse
-from models.measurement.covariance.noise import BURST_BLOCK, NoiseModel, in_blocks
-from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import LEAST_MEAN, FittedScan, KnownWhitening, TouchFitter, Turned
+from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
 from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
-from models.measurement.responses.tables import SkinTables
+from models.measurement.tables import SkinTables
 from models.measurement.touch import (
     ACTION,
     AT_ONCE_S,
@@ -31,6 +30,7 @@ from models.measurement.touch import (
     anywhere,
     plain,
 )
+from models.measurement.whitening import Whitening
 from services.estimation.faults.wires import WireFault
 from services.estimation.filter import SkinFilter
 from services.estimation.hypotheses.detector import TouchDetector, newest_z2

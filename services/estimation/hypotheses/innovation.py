@@ -10,9 +10,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.whitening import Whitening
 from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, PLACE, RATE, VELOCITY, TouchPrior, anywhere
+from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
 from services.estimation.values.scan import Scan
 

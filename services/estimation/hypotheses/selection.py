@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.whitening import Whitening
 from models.measurement.touch import anywhere
+from models.measurement.whitening import Whitening
 from services.estimation.faults.board import BoardView
 from services.estimation.filter import Prediction
 from services.estimation.hypotheses.hypotheses import Hypotheses

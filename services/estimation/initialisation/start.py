@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.course import TouchCourse
-from models.measurement.covariance.whitening import Whitening, leave_out
 from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
-from models.measurement.responses.tables import SkinTables
+from models.measurement.tables import SkinTables
 from models.measurement.touch import PLACE, RATE, TouchPrior, anywhere
+from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults.wires import BoardScan, WireFault, WireMaps, WireTable, any_touches
 from services.estimation.values import numbers as n
-from services.estimation.values.judgement import Judgement, Verdict, judge
+from services.estimation.values.estimate import Judgement, Verdict, judge
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.responses.tables import FIELD_DEGREES, SkinTables
+from models.measurement.tables import FIELD_DEGREES, SkinTables
 from models.prereconstruction import shrunk
 from services.estimation.faults.wires import WireFault, WireKind
 from services.estimation.initialisation.baseline import (
@@ -30,7 +30,7 @@ from services.estimation.initialisation.start import (
     WiringTest,
 )
 from services.estimation.values import numbers as n
-from services.estimation.values.judgement import Judgement, judge
+from services.estimation.values.estimate import Judgement, judge
 from services.estimation.values.scan import Scan
 
 Array = NDArray[np.float64]

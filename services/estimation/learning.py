@@ -1,4 +1,6 @@
-"""What untouched scans teach filter and noise, two scans later: until then a touch may show that began slowly."""
+"""What untouched scans teach filter and noise, two scans later: until then a touch may show that began slowly; and what
+whatever pressed while nothing explained the scans may have left in the foam.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +10,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.covariance.noise import NoiseModel
-from models.measurement.covariance.whitening import Whitening, leave_out
-from services.estimation.filter import SkinFilter
+from models.measurement.noise import NoiseModel
+from models.measurement.whitening import Whitening, leave_out
+from services.estimation.filter import Memory, SkinFilter
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -72,3 +74,35 @@ class DelayedUpdate:
         weighted_residual = self._drift.update(predicted, y, white)
         if not scan.drifts and scan.live.all():
             self._noise.learn(weighted_residual, white)
+
+
+@dataclass
+class RefusedState:
+    """All that changes."""
+
+    column: Annotated[Array, "K"]  # change of |Z|, relative
+    seconds: float = 0.0
+
+
+class UnexplainedLoad:
+    """Of one skin, what scans held that nothing explained. Something may have pressed then, and foam remembers it as it
+    remembers a touch that was followed: by linear viscoelasticity, as the mean of all that pressed, weighted by how
+    lately it did.
+    """
+
+    def __init__(self, measurements: int) -> None:
+        self.now = RefusedState(np.zeros(measurements))
+
+    def refuse(self, y: Array, seconds: float) -> None:
+        """A whole scan that nothing explains; y (K,): log |Z| over what is predicted of the untouched skin."""
+        change = np.clip(np.expm1(y), -n.REFUSED_MOST, n.REFUSED_MOST)
+        self.now.column += (1 - np.exp(-seconds / n.MEMORY_FADES_S[0])) * (change - self.now.column)
+        self.now.seconds += seconds
+
+    def explained(self, at_s: float) -> list[Memory]:
+        """Scans are explained from at_s on: what whatever pressed before may have left. What was short was followed."""
+        column, seconds = self.now.column, self.now.seconds
+        if not seconds:
+            return []
+        self.now = RefusedState(np.zeros(len(column)))
+        return [Memory(column, 1.0, at_s, 0.0, 0.0, 0.0, mixed=True)] if seconds > n.CHANGING_S else []

@@ -1,1 +1,0 @@
-"""What touches and the untouched skin do to each measurement: predicted from a bundle, or measured."""
