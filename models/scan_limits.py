@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.force_limits import places
-from models.measurement.tables import DiscResponse, tables_of
+from models.measurement.response import TouchModel
+from models.measurement.tables import tables_of
 from models.measurement.touch import area_of
 from models.pressure import FOAM, disc
 from models.rolling import most_parts, order
@@ -111,7 +112,7 @@ class EarlyTouch:
         at = places(skin, radius, per_side)
         if not len(at):
             raise ValueError(f"no touch of radius {RADIUS_M * 1e3:g} mm fits on skin '{skin}'")
-        response = DiscResponse(tables_of(bundle))
+        response = tables_of(bundle).response
         self.slopes = np.array([touch_slopes(response, x, y, float(np.log(radius)), drop) for x, y in at])
         self._squares = np.einsum("pki,pkj->pkij", self.slopes, self.slopes)
 
@@ -142,7 +143,7 @@ class EarlyTouch:
         return np.array(found, float)
 
 
-def touch_slopes(response: DiscResponse, x: float, y: float, log_radius: float, drop: float) -> Array:
+def touch_slopes(response: TouchModel, x: float, y: float, log_radius: float, drop: float) -> Array:
     """(K, 4) of log |Z| to x, y, log radius and log drop, of a disc; lengths in model units, drop in S/m."""
     action = drop * float(area_of(log_radius))
     felt, to_x, to_y, grown = action * response.with_slopes(x, y, log_radius)

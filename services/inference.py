@@ -168,8 +168,7 @@ class Inference(Stage):
         if self._quiet is None or self._stated < SETTLED:
             return False
         for n in () if isinstance(self._network, OneStep) else MEANS:
-            of_mean = sigma_of_mean(self._quiet, n), n, self._tare_frames
-            if not self._operators.has(*of_mean) and self._operators(*of_mean) is not None:
+            if self._operators.prepare(sigma_of_mean(self._quiet, n), n, self._tare_frames):
                 return True
         return self.residual.prepare(self._quiet)
 

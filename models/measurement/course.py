@@ -10,16 +10,21 @@ from numpy.typing import NDArray
 
 from models.measurement import numbers as n
 from models.measurement.response import TouchModel
-from models.measurement.touch import ACTION, AT_ONCE_S, LOG_RADIUS, RATE, SHAPES, STATES, VX, VY, TouchPrior, X, Y
+from models.measurement.touch import ACTION, LOG_RADIUS, RATE, SHAPES, STATES, VX, VY, TouchPrior, X, Y
 
 Array = NDArray[np.float64]
 
-SUDDEN_STEPS: Array = float(n.SUDDEN_S) * np.arange(-2.0, 3.0)  # s
-TURN_STEPS: Array = float(n.SUDDEN_S) * np.arange(
-    -4.0, 5.0
-)  # s: the part after that in which it was seen is within them
+
+
+def _steps(parts: int) -> Array:
+    """[s] from so many parts of a scan before an instant to as many after it."""
+    most = round(parts * n.COURSE_S / n.SUDDEN_S)
+    return float(n.SUDDEN_S) * np.arange(-most, most + 1.0)
+
+
+SUDDEN_STEPS = _steps(1)
+TURN_STEPS = _steps(2)  # the part after that in which it was seen is within them
 SUDDEN_REACH_S = float(SUDDEN_STEPS[-1] + n.SUDDEN_S)
-CHANGES = 0.1  # of its strength within a scan, from which on a touch's change may bend
 STRENGTH = 0  # what of a touch a kink bends: how strongly it acts, else X + 1 or Y + 1
 
 
@@ -133,7 +138,7 @@ class TouchCourse:
         """Of each touch whether its action changes, and whether it moves, by enough to do so unevenly."""
         rise = np.abs(states[:, RATE]) * self.span_s / 2
         way = np.hypot(states[:, VX], states[:, VY]) * [self._acting(prior)[1] for prior in priors]
-        return list(zip(rise > CHANGES * np.abs(states[:, ACTION]), way > n.MOVES / 2, strict=True))
+        return list(zip(rise > n.CHANGES * np.abs(states[:, ACTION]), way > n.MOVES / 2, strict=True))
 
     def _within(self, *instants_s: float) -> list[float]:
         """Those that are within the scan, or so near that a change at once then is seen in it."""
@@ -153,7 +158,7 @@ class TouchCourse:
         """Middle and half of the time within the scan in which a touch acts."""
         half_s = self.span_s / 2
         first_s, last_s = max(-half_s, min(prior.since_s, half_s)), min(half_s, max(prior.until_s, -half_s))
-        return (first_s + last_s) / 2, max((last_s - first_s) / 2, AT_ONCE_S)
+        return (first_s + last_s) / 2, max((last_s - first_s) / 2, n.AT_ONCE_S)
 
     def _moved(self, state: Array, prior: TouchPrior) -> Array:
         """(6, K) response where the touch is when each value is measured, its slopes to x, y, log radius, and those to
@@ -162,21 +167,18 @@ class TouchCourse:
         middle_s, half_s = self._acting(prior)
         x, y, log_radius = state[X] + state[VX] * middle_s, state[Y] + state[VY] * middle_s, state[LOG_RADIUS]
         way = 2 * half_s * np.hypot(state[VX], state[VY])
-        moved = np.empty((6, len(self._times_s)))
         middle = self._response.with_slopes(x, y, log_radius)
         if way <= max(n.MOVES, n.BENDS_BY * np.exp(log_radius)):
-            moved[:4] = middle
-            moved[4:] = middle[1:3] * self._times_s
-            moved[0] += (state[[VX, VY]] @ middle[1:3]) * (self._times_s - middle_s)
-            return moved
+            going = middle[1:3] * self._times_s
+            middle[0] += (state[[VX, VY]] @ middle[1:3]) * (self._times_s - middle_s)
+            return np.concatenate([middle, going])
         first = self._response.with_slopes(x - state[VX] * half_s, y - state[VY] * half_s, log_radius)
         last = self._response.with_slopes(x + state[VX] * half_s, y + state[VY] * half_s, log_radius)
         u = (self._times_s - middle_s) / half_s
         before, at, after = (u**2 - u) / 2, 1 - u**2, (u**2 + u) / 2  # Lagrange's
-        moved[:4] = before * first + at * middle + after * last
-        moved[4:] = (middle_s - half_s) * before * first[1:3] + middle_s * at * middle[1:3]
-        moved[4:] += (middle_s + half_s) * after * last[1:3]
-        return moved
+        going = (middle_s - half_s) * before * first[1:3] + middle_s * at * middle[1:3]
+        going += (middle_s + half_s) * after * last[1:3]
+        return np.concatenate([before * first + at * middle + after * last, going])
 
     def _strengths(self, state: Array, prior: TouchPrior, changes: bool) -> Array:
         """(n, K): hats of how strongly a touch acts. Those of a touch that begins, ends or changes at once are finer

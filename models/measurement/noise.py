@@ -30,15 +30,12 @@ from models.measurement.whitening import Whitening
 Array = NDArray[np.float64]
 Order = NDArray[np.intp]
 
-BURST_BLOCK = 12  # measurements that share one strength of a disturbance that comes and goes
-MEDIAN_OF_SQUARES = 0.455  # of a standard normal variable
+BURST_BLOCK = int(n.BURST_BLOCK)
 ROUNDS = 10  # of learning from the frames of a tare
 STEADY_CONTACTS = 40  # measurements whose contacts are quiet enough to tell the white noise
 
 
 FIRST_LINES = (16, 32, 64)  # scans heard, at which lines are made for the first times
-LINE_SCANS = 100  # untouched scans after which they are made anew: half of those that are learnt from
-ELSEWHERE = 300  # scans heard that end with other parts, after which it is one of those that is learnt from
 FOLLOWS = 1.5  # scans: one that comes no later than that after another follows it
 
 
@@ -67,33 +64,25 @@ class LineState:
         nothing = np.zeros((measurements, measurements))
         return cls(part, nothing, nothing.copy(), nothing.copy(), np.zeros((measurements, 0)), np.zeros((0, 0)))
 
-    def take_in(self, left: Array, odd: bool) -> None:
-        """A residual (K,)."""
-        share = max(1 / (self.heard + 1), float(n.LEARNING_LINES))
-        _blend(self.scatter, share, left, left)
+    def take(self, left: Array, odd: bool, at_s: float, span_s: float) -> bool:
+        """A residual (K,). Two of scans that were explained alike make a step: whether this one did."""
+        _blend(self.scatter, max(1 / (self.heard + 1), float(n.LEARNING_LINES)), left, left)
         self.heard += 1
-        self.due = self.due or odd or self.heard in FIRST_LINES or self.heard % LINE_SCANS == 0
-
-    def take_step(self, left: Array, odd: bool, at_s: float, span_s: float) -> bool:
-        """Residuals of two scans that were explained alike make a step: whether this one (K,) did."""
+        self.due = self.due or odd or self.heard in FIRST_LINES or self.heard % n.LINE_SCANS == 0
         before, before_s = (self.before_odd, self.before_odd_s) if odd else (self.before, self.before_s)
         if before is not None:
             step = left - before
             share = min(1.0, max(2 / self.heard, 2 * float(n.LEARNING_LINES)))
             _blend(self.alternates, share, step / 2, step)
             if 0 < at_s - before_s < FOLLOWS * span_s:
-                self._follow(left, before)
+                self.followed += 1
+                _blend(self.follows, max(1 / self.followed, 2 * float(n.LEARNING_LINES)), left, before)
         kept = None if before is not None else left
         if odd:
             self.before_odd, self.before_odd_s = kept, at_s
         else:
             self.before, self.before_s = kept, at_s
         return before is not None
-
-    def _follow(self, left: Array, before: Array) -> None:
-        self.followed += 1
-        share = max(1 / self.followed, 2 * float(n.LEARNING_LINES))
-        _blend(self.follows, share, left, before)
 
     def make(self, white: float) -> None:
         """The columns anew; white: variance of what disturbs one measurement alone."""
@@ -162,12 +151,11 @@ class Lines:
         """
         if part != self.now.part:
             self.now.elsewhere += 1
-            if self.now.heard and self.now.elsewhere < ELSEWHERE:
+            if self.now.heard and self.now.elsewhere < n.ELSEWHERE:
                 return False
             self.now = self._begun(part)
         self.now.elsewhere = 0
-        self.now.take_in(left, odd)
-        return self.now.take_step(left, odd, at_s, span_s) and self.now.due
+        return self.now.take(left, odd, at_s, span_s) and self.now.due
 
     def _begun(self, part: int) -> LineState:
         """To be learnt of scans that end with this part from now on; until then what is known of them holds."""
@@ -210,12 +198,12 @@ class NoiseModel:
         part = max(set(parts), key=parts.count)
         alike = np.array(parts) == part
         steps = np.diff(residuals, axis=0)
-        self.now.white = max(float(np.median(steps**2)) / 2 / MEDIAN_OF_SQUARES, float(n.RESPONSE_FLOOR**2))
+        self.now.white = max(float(np.median(steps**2)) / 2 / n.MEDIAN_OF_SQUARES, float(n.RESPONSE_FLOOR**2))
         for round_ in range(ROUNDS):
             white = Whitening.of(self.covariance(part))
             weighted_residual = white.solve(residuals.T).T  # (n, K) S^-1 e
             self._follow_contacts(weighted_residual, white, 1 / 2)
-            energy = float(np.median(weighted_residual**2 / white.conditional_precisions())) / MEDIAN_OF_SQUARES
+            energy = float(np.median(weighted_residual**2 / white.conditional_precisions())) / n.MEDIAN_OF_SQUARES
             self.now.white *= min(max(energy, 0.5), 2.0)
             if round_ >= ROUNDS // 2:
                 self.lines.hear_anew(self._left(weighted_residual[alike], part), part, self.now.white)
@@ -225,17 +213,13 @@ class NoiseModel:
         now = self.now
         return np.asarray(now.white + n.RESPONSE_FLOOR**2 + self._squares @ now.jitter)
 
-    def disturbing(self, part: int) -> Array:
-        """(K, n) columns of the lines of a scan that ends with this part."""
-        return self.lines.columns(part)
-
     def alike(self, part: int) -> int:
         """The same number for all parts whose scans are disturbed alike: 0 where nothing disturbs them."""
-        return part if self.disturbing(part).shape[1] else 0
+        return part if self.lines.columns(part).shape[1] else 0
 
     def covariance(self, part: int) -> Array:
         """(K, K) of a scan that ends with this part."""
-        columns = np.column_stack([self._contact * np.sqrt(self.now.flicker), self.disturbing(part)])
+        columns = np.column_stack([self._contact * np.sqrt(self.now.flicker), self.lines.columns(part)])
         made: Array = columns @ columns.T
         made[np.diag_indices_from(made)] += self.variances()
         return made
@@ -262,7 +246,7 @@ class NoiseModel:
 
     def _left(self, weighted_residual: Array, part: int) -> Array:
         """(..., K) the likeliest white noise and disturbance, of S^-1 y."""
-        columns = self.disturbing(part)
+        columns = self.lines.columns(part)
         return np.asarray(self.variances() * weighted_residual + (weighted_residual @ columns) @ columns.T)
 
     def _follow_contacts(self, weighted_residual: Array, white: Whitening, share: float) -> None:

@@ -54,9 +54,9 @@ HARMONIC_SDS = (
     Number(0.05, "-", "third harmonic", "measured: triangles"),
     Number(0.03, "-", "fourth harmonic", "measured: squares"),
 )
-EDGE_WIDTH = Number(0.03, "unit", "width of an edge that EDGE_SD is in squares of", "chosen: 1.5 mm")
-EDGE_SD = Number(1.0, "-", "square of an edge's width", "chosen: soft by as much as EDGE_WIDTH")
+EDGE_WIDTH = Number(0.03, "unit", "width of an edge, one sigma of its square", "chosen: 1.5 mm")
 TENSOR_SD = Number(0.15, "-", "drop along a touch less that across", "measured: rectangles leave 5 to 7 % without")
+AT_ONCE_S = Number(4e-4, "s", "in which any touch begins", "derived: one measurement, SCAN_S / 120")
 """What a touch looks like."""
 
 DAMPING = Number(1e-3, "-", "of the first step, Levenberg's", "chosen: any small one")
@@ -73,8 +73,10 @@ SUDDEN_S = Number(0.002, "s", "steps of the course of a touch that begins or end
 SUDDEN_SD = Number(0.5, "-", "of its action, by which each step may differ", "derived: from none to all")
 SUDDEN_JITTER = Number(0.1, "-", "of its action, within such a step", "derived: a kink in the middle of one")
 STEADY = Number(0.05, "-", "of its action, by which one that ended at once changed before", "derived: foam creeps so")
-COURSE_S = Number(0.0044, "s", "steps of the course of a touch that changes", "derived: a part of a scan")
+SCAN_S = Number(0.0437, "s", "a whole scan of 120 measurements", "measured: by the board's clock")
+COURSE_S = Number(0.0044, "s", "steps of the course of a touch that changes", "derived: a part, SCAN_S / 10")
 COURSE_SD = Number(0.3, "-", "of its change, by which each may differ", "derived: a ramp that ends half way: 0.25 off")
+CHANGES = Number(0.1, "-", "change of its action in a scan that may bend", "derived: COURSE_JITTER / COURSE_SD")
 COURSE_JITTER = Number(0.03, "-", "of its action, within such a step", "derived: ramps of 20 ms and more")
 BENDS_BY = Number(0.15, "-", "and of its radius", "derived: its square over 8 is 0.3 %, below MISFIT")
 KINK = Number(0.8, "-", "of a change within a scan: what of it may be no straight line", "derived: a ramp's half")
@@ -92,4 +94,10 @@ LINES = Number(6.0, "-", "eigenvectors of lines at most", "chosen: three frequen
 ALTERNATES = Number(4.0, "-", "times what alternates from scan to scan, of a line at most", "derived: beats of 9")
 LEFT_OUT = Number(1e4, "-", "variance of a measurement that does not count", "derived: nothing is as large")
 OUTLIER = Number(9.0, "-", "squared sigmas beyond which a residual counts no further", "derived: 3 sigmas")
+LINE_SCANS = Number(100.0, "-", "untouched scans after which lines are made anew", "derived: half of LEARNING_LINES")
+ELSEWHERE = Number(300.0, "-", "scans that end with other parts, until those are learnt from", "chosen: 13 s")
+BURST_BLOCK = Number(12.0, "-", "measurements in which what comes and goes is as strong", "derived: a part of a scan")
+LEAST_NOISE = Number(2e-6, "-", "noise of |Z| at least", "derived: half of a step of the board's 18 bits")
+MEDIAN_OF_SQUARES = Number(0.455, "-", "of a standard normal variable", "derived: chi^2 of one degree of freedom")
+MEDIAN_DEVIATION = Number(0.6745, "-", "of a standard normal variable", "derived: root of MEDIAN_OF_SQUARES")
 """What noise is."""

@@ -1,44 +1,186 @@
-"""What any response of touches offers, discs all over the skin, and the response that a registered skin was measured to
-have; a disc's by its tables is models/measurement/tables.py:DiscResponse.
+"""What touches do to the measurements: discs of conductivity drop, or what was measured on a registered skin.
+
+A disc covers pixels by its distance to their centres, linearly over one pixel's side; that adds side^2 / 12 to the
+mean square of its radius, which is taken off again.
 """
 
 from __future__ import annotations
 
 from copy import copy
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from models.locator_arrays import LocatorArrays
-from models.measurement.numbers import TYPICAL_RADIUS
-from models.measurement.touch import SHAPES
+from models.measurement import numbers as n
+from models.measurement.touch import SHAPES, area_of
 from models.measurement.whitening import Whitening
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
+RIM = 2.0  # pixels over which slopes are taken: over one they scatter by a fifth
+CLOSE = 1e-6  # units: nearer to the centre no direction is known
+HARMONICS = range(2, 2 + len(n.HARMONIC_SDS))
+RADII = ((n.TYPICAL_RADIUS / 2, 0.1), (n.TYPICAL_RADIUS, 0.12), (0.33, 0.2))  # of discs, and between centres [unit]
+INWARD = 0.9  # of its radius that a disc's centre is within the sheet's edge
 
-class TouchModel(Protocol):
-    """Relative change of |Z| by a touch of unit action."""
+
+class Covered(NamedTuple):
+    """Pixels about a disc."""
+
+    rows: slice
+    columns: slice
+    x: Array  # (n, m) from the centre
+    y: Array
+    distance: Array
+    share: Array  # covered
+    rim: Array  # share per length that the outline moves outward
+
+
+class DiscResponse:
+    """Relative change of |Z| by a disc of unit action: its strength times its area is 1, whatever its radius."""
+
+    def __init__(self, jacobian: Single, along: Single, turned: Single, inside: NDArray[np.bool_]) -> None:
+        """See models/measurement/tables.py:SkinTables."""
+        self._jacobian, self._along, self._turned = jacobian, along, turned
+        self._pixel = 2.0 / len(jacobian)
+        self._axis: Array = np.asarray((np.arange(len(jacobian)) + 0.5) * self._pixel - 1, float)
+        self.discs = _on_the_skin(_grid_of_discs(), inside)  # (A, 3) x, y, log radius: all over the skin
 
     def __call__(self, x: float, y: float, log_radius: float) -> Array:
         """(K,)"""
-        ...
+        at = self._covered(x, y, log_radius)
+        return np.asarray(self._sum(self._jacobian, at, at.share[None])[0] / area_of(log_radius))
 
     def with_slopes(self, x: float, y: float, log_radius: float) -> Array:
         """(4, K): response, and its slopes to x, y and log radius."""
-        ...
+        at = self._covered(x, y, log_radius)
+        found = self._sum(self._jacobian, at, self._moved(at, log_radius)) / area_of(log_radius)
+        found[3] -= 2 * found[0]  # a larger disc of the same action is weaker
+        return found
 
     def directions(self, x: float, y: float, log_radius: float) -> Array:
-        """(9, K): in which a touch differs from the mean one, see models/measurement/touch.py."""
-        ...
+        """(9, K) the touch's own directions, see models/measurement/touch.py."""
+        at = self._covered(x, y, log_radius)
+        found = np.empty((SHAPES, self._jacobian.shape[2]))
+        outlines = np.stack([*self._outlines(at, log_radius), self._edge(at)])
+        found[:-2] = self._sum(self._jacobian, at, outlines)
+        found[-2] = self._sum(self._along, at, at.share[None])[0]
+        found[-1] = self._sum(self._turned, at, at.share[None])[0]
+        return found / area_of(log_radius)
 
-    @property
-    def discs(self) -> Array:
-        """(A, 3) x, y, log radius: where something may touch."""
-        ...
+    def _covered(self, x: float, y: float, log_radius: float) -> Covered:
+        pixel, side = self._pixel, len(self._axis)
+        radius = np.exp(log_radius)
+        reach = radius + 2 * pixel
+        rows = slice(max(0, int((y - reach + 1) / pixel)), min(side, int((y + reach + 1) / pixel) + 1))
+        columns = slice(max(0, int((x - reach + 1) / pixel)), min(side, int((x + reach + 1) / pixel) + 1))
+        from_x: Array = self._axis[None, columns] - x
+        from_y: Array = self._axis[rows, None] - y
+        distance = np.sqrt(from_x**2 + from_y**2)
+        drawn = np.sqrt(max(radius**2 - pixel**2 / 12, (pixel / 2) ** 2))
+        inward = (drawn - distance) / pixel
+        share = np.minimum(np.maximum(inward + 0.5, 0.0), 1.0)
+        rim = (np.abs(inward) < RIM / 2) / (RIM * pixel)
+        return Covered(rows, columns, from_x, from_y, distance, share, rim)
+
+    def _moved(self, at: Covered, log_radius: float) -> Array:
+        outward = at.rim / np.maximum(at.distance, CLOSE)
+        return np.stack([at.share, outward * at.x, outward * at.y, at.rim * np.exp(log_radius)])
+
+    def _outlines(self, at: Covered, log_radius: float) -> list[Array]:
+        """Outlines r (1 + h cos m phi) and r (1 + h sin m phi)."""
+        turned = (at.x + 1j * at.y) / np.maximum(at.distance, CLOSE)
+        lifted = at.rim * np.exp(log_radius)
+        waves = [turned**harmonic for harmonic in HARMONICS]
+        return [lifted * part for wave in waves for part in (wave.real, wave.imag)]
+
+    def _edge(self, at: Covered) -> Array:
+        """A blur of variance w^2 adds w^2 / 2 times the Laplacian."""
+        bent = -4 * at.share
+        bent[1:] += at.share[:-1]
+        bent[:-1] += at.share[1:]
+        bent[:, 1:] += at.share[:, :-1]
+        bent[:, :-1] += at.share[:, 1:]
+        return 0.5 * (n.EDGE_WIDTH / self._pixel) ** 2 * bent
+
+    def _sum(self, table: NDArray[np.float32], at: Covered, weights: Array) -> Array:
+        """(c, K) of weights (c, n, m)."""
+        block = table[at.rows, at.columns].reshape(-1, table.shape[2])
+        return (weights.reshape(len(weights), -1).astype(np.float32) @ block).astype(float)
+
+
+def _grid_of_discs() -> Array:
+    found = list[Array]()
+    for radius, step in RADII:
+        reach = n.SHEET - INWARD * radius
+        axis = np.linspace(-reach, reach, 1 + round(2 * reach / step))
+        x, y = np.meshgrid(axis, axis)
+        found.append(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, np.log(radius))]))
+    return np.concatenate(found)
+
+
+def _on_the_skin(discs: Array, inside: NDArray[np.bool_]) -> Array:
+    """Those whose centres are; inside (F, F): its pixels."""
+    pixels = np.floor((discs[:, :2] + 1) / 2 * len(inside)).astype(int)
+    return np.asarray(discs[inside[pixels[:, 1], pixels[:, 0]]])
+
+
+class MeasuredMap:
+    """What a mean press does at each place of one registered skin, its slopes, and its error. An action of 1 is the
+    registration's mean press. The map has no radius: how large a touch is, it does not tell. Its error is one dense
+    covariance of a fixed size, from presses that were left out of it: as a diagonal, or in proportion to the touch,
+    places are worse.
+    """
+
+    def __init__(self, arrays: LocatorArrays, metres_per_unit: float, mean_press: float = 1.0) -> None:
+        """mean_press: action of the registration's mean press."""
+        rows, columns = (int(side) for side in arrays.shape)
+        allowed = arrays.allowed.reshape(rows, columns)
+        table = np.zeros((rows, columns, arrays.map.shape[1]))
+        table[allowed] = arrays.map / mean_press
+        nearest = distance_transform_edt(~allowed, return_distances=False, return_indices=True)
+        table = table[tuple(nearest)]  # beyond the presses, as where they end
+        self._corner = np.asarray(arrays.corner, float) / metres_per_unit
+        self._spacing = float(arrays.spacing) / metres_per_unit
+        slopes = [np.gradient(table, self._spacing, axis=axis) for axis in (1, 0)]
+        self._table: Array = np.stack([table, *slopes])  # (3, rows, columns, K)
+        self.error = _of_touches(np.asarray(arrays.error, float), np.asarray(arrays.noise, float))
+        iy, ix = np.nonzero(allowed)
+        places = self._corner + self._spacing * np.column_stack([ix, iy])
+        self.discs = np.column_stack([places, np.full(len(places), np.log(n.TYPICAL_RADIUS))])  # (A, 3) all of the map
+
+    def through(self, slopes: Array) -> MeasuredMap:
+        """The same seen through a fault of the wires; slopes (K, K)."""
+        seen = copy(self)
+        seen._table, seen.error = self._table @ slopes.T, slopes @ self.error @ slopes.T
+        return seen
+
+    def __call__(self, x: float, y: float, log_radius: float) -> Array:
+        """(K,)"""
+        return np.asarray(self.with_slopes(x, y, log_radius)[0])
+
+    def with_slopes(self, x: float, y: float, log_radius: float) -> Array:
+        """(4, K): response, its slopes to x and y, and 0 for the radius."""
+        rows, columns = self._table.shape[1:3]
+        across = np.clip((x - self._corner[0]) / self._spacing, 0, columns - 1.001)
+        along = np.clip((y - self._corner[1]) / self._spacing, 0, rows - 1.001)
+        ix, iy = int(across), int(along)
+        u, v = across - ix, along - iy
+        block = self._table[:, iy : iy + 2, ix : ix + 2]
+        weight = np.array([[(1 - u) * (1 - v), u * (1 - v)], [(1 - u) * v, u * v]])
+        found = np.einsum("cyxk,yx->ck", block, weight)
+        return np.concatenate([found, np.zeros_like(found[:1])])
+
+    def directions(self, x: float, y: float, log_radius: float) -> Array:
+        """(9, K) of nothing: what touches differ by is in `error`."""
+        return np.zeros((SHAPES, self._table.shape[3]))
+
+
+TouchModel = DiscResponse | MeasuredMap
 
 
 class DiscGrid:
@@ -65,63 +207,6 @@ class DiscGrid:
         z2 = along**2 / information
         best = int(z2.argmax())
         return float(z2[best]), best, float(along[best] / information[best])
-
-
-class MeasuredMap:
-    """What a mean press does at each place of one registered skin, its slopes, and its error. An action of 1 is the
-    registration's mean press. The map has no radius: how large a touch is, it does not tell. Its error is one dense
-    covariance of a fixed size, from presses that were left out of it: as a diagonal, or in proportion to the touch,
-    places are worse.
-    """
-
-    def __init__(self, arrays: LocatorArrays, metres_per_unit: float, mean_press: float = 1.0) -> None:
-        """mean_press: action of the registration's mean press."""
-        rows, columns = (int(side) for side in arrays.shape)
-        allowed = arrays.allowed.reshape(rows, columns)
-        table = np.zeros((rows, columns, arrays.map.shape[1]))
-        table[allowed] = arrays.map / mean_press
-        nearest = distance_transform_edt(~allowed, return_distances=False, return_indices=True)
-        table = table[tuple(nearest)]  # beyond the presses, as where they end
-        self._corner = np.asarray(arrays.corner, float) / metres_per_unit
-        self._spacing = float(arrays.spacing) / metres_per_unit
-        slopes = [np.gradient(table, self._spacing, axis=axis) for axis in (1, 0)]
-        self._table: Array = np.stack([table, *slopes])  # (3, rows, columns, K)
-        self.error = _of_touches(np.asarray(arrays.error, float), np.asarray(arrays.noise, float))
-        iy, ix = np.nonzero(allowed)
-        places = self._corner + self._spacing * np.column_stack([ix, iy])
-        self._discs = np.column_stack([places, np.full(len(places), np.log(TYPICAL_RADIUS))])
-
-    def through(self, slopes: Array) -> MeasuredMap:
-        """The same seen through a fault of the wires; slopes (K, K)."""
-        seen = copy(self)
-        seen._table, seen.error = self._table @ slopes.T, slopes @ self.error @ slopes.T
-        return seen
-
-    @property
-    def discs(self) -> Array:
-        """(A, 3) all places of the map."""
-        return self._discs
-
-    def __call__(self, x: float, y: float, log_radius: float) -> Array:
-        """(K,)"""
-        return np.asarray(self.with_slopes(x, y, log_radius)[0])
-
-    def with_slopes(self, x: float, y: float, log_radius: float) -> Array:
-        """(4, K): response, its slopes to x and y, and 0 for the radius."""
-        rows, columns = self._table.shape[1:3]
-        across = np.clip((x - self._corner[0]) / self._spacing, 0, columns - 1.001)
-        along = np.clip((y - self._corner[1]) / self._spacing, 0, rows - 1.001)
-        ix, iy = int(across), int(along)
-        u, v = across - ix, along - iy
-        block = self._table[:, iy : iy + 2, ix : ix + 2]
-        weight = np.array([[(1 - u) * (1 - v), u * (1 - v)], [(1 - u) * v, u * v]])
-        found = np.zeros((4, self._table.shape[3]))
-        found[:3] = np.einsum("cyxk,yx->ck", block, weight)
-        return found
-
-    def directions(self, x: float, y: float, log_radius: float) -> Array:
-        """(9, K) of nothing: what touches differ by is in `error`."""
-        return np.zeros((SHAPES, self._table.shape[3]))
 
 
 def _of_touches(error: Array, noise: Array) -> Array:

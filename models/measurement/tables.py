@@ -1,8 +1,4 @@
-"""What a bundle tells of a skin: what drops and contact impedances do to each measurement, and by that discs.
-
-A disc covers pixels by its distance to their centres, linearly over one pixel's side; that adds side^2 / 12 to the
-mean square of its radius, which is taken off again.
-"""
+"""What a bundle tells of the untouched skin: what drops and contact impedances do to each measurement."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -20,18 +16,13 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.calibration_file import found_by
 from models.measurement import numbers as n
-from models.measurement.response import DiscGrid, MeasuredMap, TouchModel
-from models.measurement.touch import SHAPES, area_of
+from models.measurement.response import DiscGrid, DiscResponse, MeasuredMap, TouchModel
+from models.measurement.touch import area_of
 from models.patterns import incidence
 
 MOST_DEGREE = 3
 FIELD_MODES = [(d - j, j) for d in range(MOST_DEGREE + 1) for j in range(d + 1)]
 FIELD_DEGREES = tuple(i + j for i, j in FIELD_MODES)  # of each mode
-RIM = 2.0  # pixels over which slopes are taken: over one they scatter by a fifth
-CLOSE = 1e-6  # units: nearer to the centre no direction is known
-HARMONICS = (2, 3, 4)
-RADII = ((0.09, 0.1), (0.18, 0.12), (0.33, 0.2))  # of discs, and how far apart their centres are [unit]
-INWARD = 0.9  # of its radius that a disc's centre is within the sheet's edge
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 T = TypeVar("T")
@@ -74,7 +65,7 @@ class SkinTables:
     @cached_property
     def response(self) -> TouchModel:
         """What touches do. Where none is known, discs on the bundle's own skin: they see that something touches."""
-        return DiscResponse(self) if self.map is None else self.map
+        return self.map or DiscResponse(self.jacobian, self.along, self.turned, self.inside)
 
     @cached_property
     def grid(self) -> DiscGrid:
@@ -85,11 +76,6 @@ class SkinTables:
         """(K, K) covariance of what the response gets wrong of touches of this squared change."""
         made = self.wrong**2 * size2 * self.misfit
         return made if self.map is None else made + self.map.error
-
-    @property
-    def pixel(self) -> float:
-        """Side of a pixel."""
-        return 2.0 / len(self.jacobian)
 
     def relative_to(self, z0: Array) -> SkinTables:
         """The same of a skin whose untouched |Z| was measured: the impedances that a touch adds are the bundle's, up to
@@ -131,119 +117,6 @@ class SkinTables:
             misfit=_of_trace_one(slopes @ self.misfit @ slopes.T),
             map=None if self.map is None else self.map.through(slopes),
         )
-
-
-class Covered(NamedTuple):
-    """Pixels about a disc."""
-
-    rows: slice
-    columns: slice
-    x: Array  # (n, m) from the centre
-    y: Array
-    distance: Array
-    share: Array  # covered
-    rim: Array  # share per length that the outline moves outward
-
-
-class DiscResponse:
-    """Of unit action, on one skin's tables: the disc's strength times its area is 1, whatever its radius."""
-
-    def __init__(self, tables: SkinTables) -> None:
-        self.tables = tables
-        side = len(tables.jacobian)
-        self._pixel = tables.pixel
-        self._axis: Array = np.asarray((np.arange(side) + 0.5) * self._pixel - 1, float)
-
-    @property
-    def discs(self) -> Array:
-        """(A, 3) x, y, log radius: all over the skin."""
-        return _on_the_skin(_grid_of_discs(), self.tables.inside)
-
-    def __call__(self, x: float, y: float, log_radius: float) -> Array:
-        """(K,)"""
-        at = self._covered(x, y, log_radius)
-        return np.asarray(self._sum(self.tables.jacobian, at, at.share[None])[0] / area_of(log_radius))
-
-    def with_slopes(self, x: float, y: float, log_radius: float) -> Array:
-        """(4, K): response, and its slopes to x, y and log radius."""
-        at = self._covered(x, y, log_radius)
-        found = self._sum(self.tables.jacobian, at, self._moved(at, log_radius)) / area_of(log_radius)
-        found[3] -= 2 * found[0]  # a larger disc of the same action is weaker
-        return found
-
-    def directions(self, x: float, y: float, log_radius: float) -> Array:
-        """(9, K) the touch's own directions, see models/measurement/touch.py."""
-        at = self._covered(x, y, log_radius)
-        found = np.empty((SHAPES, self.tables.measurements))
-        outlines = np.stack([*self._outlines(at, log_radius), self._edge(at)])
-        found[:-2] = self._sum(self.tables.jacobian, at, outlines)
-        found[-2] = self._sum(self.tables.along, at, at.share[None])[0]
-        found[-1] = self._sum(self.tables.turned, at, at.share[None])[0]
-        return found / area_of(log_radius)
-
-    def _covered(self, x: float, y: float, log_radius: float) -> Covered:
-        pixel, side = self._pixel, len(self._axis)
-        radius = np.exp(log_radius)
-        reach = radius + 2 * pixel
-        rows = slice(max(0, int((y - reach + 1) / pixel)), min(side, int((y + reach + 1) / pixel) + 1))
-        columns = slice(max(0, int((x - reach + 1) / pixel)), min(side, int((x + reach + 1) / pixel) + 1))
-        from_x: Array = self._axis[None, columns] - x
-        from_y: Array = self._axis[rows, None] - y
-        distance = np.sqrt(from_x**2 + from_y**2)
-        drawn = np.sqrt(max(radius**2 - pixel**2 / 12, (pixel / 2) ** 2))
-        inward = (drawn - distance) / pixel
-        share = np.minimum(np.maximum(inward + 0.5, 0.0), 1.0)
-        rim = (np.abs(inward) < RIM / 2) / (RIM * pixel)
-        return Covered(rows, columns, from_x, from_y, distance, share, rim)
-
-    def _moved(self, at: Covered, log_radius: float) -> Array:
-        outward = at.rim / np.maximum(at.distance, CLOSE)
-        weights = np.empty((4, *at.share.shape))
-        weights[0] = at.share
-        weights[1] = outward * at.x
-        weights[2] = outward * at.y
-        weights[3] = at.rim * np.exp(log_radius)
-        return weights
-
-    def _outlines(self, at: Covered, log_radius: float) -> list[Array]:
-        """Outlines r (1 + h cos m phi) and r (1 + h sin m phi)."""
-        turned = (at.x + 1j * at.y) / np.maximum(at.distance, CLOSE)
-        lifted = at.rim * np.exp(log_radius)
-        found = []
-        for harmonic in HARMONICS:
-            wave = turned**harmonic
-            found += [lifted * wave.real, lifted * wave.imag]
-        return found
-
-    def _edge(self, at: Covered) -> Array:
-        """A blur of variance w^2 adds w^2 / 2 times the Laplacian."""
-        bent = -4 * at.share
-        bent[1:] += at.share[:-1]
-        bent[:-1] += at.share[1:]
-        bent[:, 1:] += at.share[:, :-1]
-        bent[:, :-1] += at.share[:, 1:]
-        return 0.5 * (n.EDGE_WIDTH / self._pixel) ** 2 * bent
-
-    def _sum(self, table: NDArray[np.float32], at: Covered, weights: Array) -> Array:
-        """(c, K) of weights (c, n, m)."""
-        block = table[at.rows, at.columns].reshape(-1, table.shape[2])
-        return (weights.reshape(len(weights), -1).astype(np.float32) @ block).astype(float)
-
-
-def _grid_of_discs() -> Array:
-    found = list[Array]()
-    for radius, step in RADII:
-        reach = n.SHEET - INWARD * radius
-        axis = np.linspace(-reach, reach, 1 + round(2 * reach / step))
-        x, y = np.meshgrid(axis, axis)
-        found.append(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, np.log(radius))]))
-    return np.concatenate(found)
-
-
-def _on_the_skin(discs: Array, inside: NDArray[np.bool_]) -> Array:
-    """Those whose centres are; inside (F, F): its pixels."""
-    pixels = np.floor((discs[:, :2] + 1) / 2 * len(inside)).astype(int)
-    return np.asarray(discs[inside[pixels[:, 1], pixels[:, 0]]])
 
 
 def tells_touches(bundle: Bundle) -> bool:
@@ -338,8 +211,8 @@ def _from_fields(bundle: Bundle, z0: Array, coarse: Single) -> tuple[Single, Sin
 def _signs(fine: Array, coarse: Single) -> Array:
     """(K,) 1 or -1 for each measurement, as the coarse table has it."""
     side, block = len(coarse), len(fine) // len(coarse)
-    summed = fine.reshape(side, block, side, block, -1).sum(axis=(1, 3))
-    return np.where(np.einsum("yxk,yxk->k", summed, coarse) < 0, -1.0, 1.0)
+    blocks = fine.reshape(side, block, side, block, -1)
+    return np.where(np.einsum("yaxbk,yxk->k", blocks, coarse, optimize=True) < 0, -1.0, 1.0)
 
 
 def _field(jacobian: Single, contact: Array) -> Array:

@@ -16,20 +16,19 @@ Array = NDArray[np.float64]
 # Numbers of a disc's state. X, Y: centre at the reference instant [unit]. LOG_RADIUS. ACTION: drop / (1 - drop / 2)
 # times the area [unit^2]: the measurements are linear in it, and tell it best. RATE: of ACTION [unit^2/s]. VX, VY
 # [unit/s].
-X, Y, LOG_RADIUS, ACTION, RATE, VX, VY = range(7)
 STATES = 7
+X, Y, LOG_RADIUS, ACTION, RATE, VX, VY = range(STATES)
 PLACE, VELOCITY = slice(X, Y + 1), slice(VX, VY + 1)
 
 # Directions in which a touch of that area differs from a disc, as multiples of its action: outline's harmonics 2, 3
 # and 4 (cosine and sine, relative to the radius), the square of the edge's width, the drop along x less that along y,
 # and the drop that turns x into y.
-SHAPES = 9
-EDGE = 6
 PLAIN = 1e-3  # of what shapes differ by
 MOST_ACTS = float(n.MOST_STRENGTH * np.pi * n.MOST_RADIUS**2)  # unit^2: nothing conducts in the largest
 ANYWHERE_SD = 2.0  # unit: the sheet's width
-AT_ONCE_S = 4e-4  # one measurement: nothing begins faster
-SHAPE_SDS: Array = np.array([sd for sd in n.HARMONIC_SDS for _ in range(2)] + [n.EDGE_SD, n.TENSOR_SD, n.TENSOR_SD])
+EDGE = 2 * len(n.HARMONIC_SDS)
+SHAPE_SDS: Array = np.array([*np.repeat(n.HARMONIC_SDS, 2), 1.0, n.TENSOR_SD, n.TENSOR_SD])
+SHAPES = len(SHAPE_SDS)
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ def within_limits(states: Array) -> Array:
     limited = states.copy()
     limited[:, PLACE] = np.minimum(np.maximum(limited[:, PLACE], -n.SHEET), n.SHEET)
     limited[:, ACTION] = np.minimum(limited[:, ACTION], MOST_ACTS)
-    limited[:, RATE] = np.minimum(np.maximum(limited[:, RATE], -MOST_ACTS / AT_ONCE_S), MOST_ACTS / AT_ONCE_S)
+    limited[:, RATE] = np.minimum(np.maximum(limited[:, RATE], -MOST_ACTS / n.AT_ONCE_S), MOST_ACTS / n.AT_ONCE_S)
     acts = np.maximum(limited[:, ACTION], n.LEAST_ACTION)
     least = np.maximum(0.5 * np.log(acts / (np.pi * n.MOST_STRENGTH)), np.log(n.LEAST_RADIUS))
     limited[:, LOG_RADIUS] = np.minimum(np.maximum(limited[:, LOG_RADIUS], least), np.log(n.MOST_RADIUS))

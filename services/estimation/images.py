@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
-from functools import lru_cache
-from typing import Any, NamedTuple
+from collections import deque
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.bundle import Bundle
+from models.measurement.numbers import TINY
 from models.prereconstruction import Drift, Operator, PreReconstructor
 from services.estimation.values.state import shaped
 
 Array = NDArray[np.float64]
+Key = TypeVar("Key")
+Made = TypeVar("Made")
 
 CHANGED = 1e-3  # probability that an unchanged touch is reconstructed again: costs work, not truth
 LONGEST_MEAN = 16  # frames that are averaged at most, and after which a touch is reconstructed again at the latest
-MEANS = (1, 2, 4, 8, LONGEST_MEAN)  # frames in what is reconstructed of a touch
+MEANS = tuple(1 << k for k in range(LONGEST_MEAN.bit_length()))  # frames in what is reconstructed of a touch
 KEPT = 16  # operators, and matrices of noises of frames; 0.4 and 0.3 MB each
 SUREST = 1e-4  # relative: below it the model is what a mean is wrong by, and that does not average out
 DRIFTS_S = 0.25  # of the drift that skin.toml allows: what is left of it beside a touch
@@ -29,33 +33,39 @@ def sigma_of_mean(sigma: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     return np.asarray(sigma / np.sqrt(n), np.float32)
 
 
+def kept(made: dict[Key, Made], key: Key, make: Callable[[], Made]) -> Made:
+    """What was made for a key, of which the newest KEPT are held; made where it is not there."""
+    if key not in made:
+        if len(made) >= KEPT:
+            del made[next(iter(made))]
+        made[key] = make()
+    return made[key]
+
+
 class Operators:
     """Of one skin. Each is made once, which takes 10 ms."""
 
     def __init__(self, pre: PreReconstructor, scale_per_s: float, contact_per_s: float) -> None:
         """How fast an untouched skin may change, relative: its conductivity, and each electrode's contact impedance."""
         self._pre, self._drift = pre, Drift(scale_per_s * DRIFTS_S, contact_per_s * DRIFTS_S)
-        self._made: dict[tuple[bytes, int, int], Operator] = {}
+        self._made: dict[tuple[bytes, int, int], Operator | None] = {}
 
     def __call__(self, sigma: NDArray[np.float32], averaged: int, tare_frames: int) -> Operator | None:
         """For the mean of so many scans, whose standard deviation is sigma (K,), infinite where a measurement does not
         count, against the mean of `tare_frames`. None where too few count.
         """
         key = sigma.tobytes(), averaged, tare_frames
-        if key not in self._made:
-            if np.isfinite(sigma).sum() < FEWEST:
-                return None
-            if len(self._made) >= KEPT:
-                self._made.pop(next(iter(self._made)))
-            self._made[key] = self._make(sigma.astype(float), averaged, tare_frames)
-        return self._made[key]
+        return kept(self._made, key, lambda: self._make(sigma.astype(float), averaged, tare_frames))
 
-    def has(self, sigma: NDArray[np.float32], averaged: int, tare_frames: int) -> bool:
-        """Whether it is there already."""
-        return (sigma.tobytes(), averaged, tare_frames) in self._made
+    def prepare(self, sigma: NDArray[np.float32], averaged: int, tare_frames: int) -> bool:
+        """Make that one; False: it is there, or there is none."""
+        there = (sigma.tobytes(), averaged, tare_frames) in self._made
+        return not there and self(sigma, averaged, tare_frames) is not None
 
-    def _make(self, sigma: NDArray[np.float64], averaged: int, tare_frames: int) -> Operator:
+    def _make(self, sigma: NDArray[np.float64], averaged: int, tare_frames: int) -> Operator | None:
         live = np.isfinite(sigma)
+        if live.sum() < FEWEST:
+            return None
         single = sigma * np.sqrt(averaged)
         most = int((float(np.median(single[live])) / SUREST) ** 2)  # as far as noise is what a mean is wrong by
         counted = min(averaged, max(1, most))
@@ -131,10 +141,7 @@ class Reconstruction:
 
     def prepare(self) -> bool:
         """Make the operator that the next touch needs first; False: it is there."""
-        sigma = self.sigma.astype(np.float32)
-        if self._operators.has(sigma, 1, self.frames):
-            return False
-        return self._operators(sigma, 1, self.frames) is not None
+        return self._operators.prepare(self.sigma.astype(np.float32), 1, self.frames)
 
     def state(self) -> dict[str, Any]:
         return {
@@ -185,7 +192,7 @@ class Residual:
         self.pre, self.to_scale = bundle.prereconstructor(), to_scale
         self.shape: tuple[int, int] = bundle.matrices.inside.shape
         self.refused = False  # whether the last image that was given a share is of no touch
-        self._known: OrderedDict[bytes, Conditioned | None] = OrderedDict()
+        self._known: dict[bytes, Conditioned | None] = {}
 
     def __call__(
         self, difference: NDArray[np.float32], sigma: NDArray[np.float32], image: NDArray[np.float32]
@@ -207,7 +214,7 @@ class Residual:
         coarse = (down @ y @ across).ravel()
         seen, expected = known.whiten @ difference, known.forward @ coarse
         if not self.to_scale:
-            expected *= max(0.0, float(expected @ seen)) / max(float(expected @ expected), 1e-30)
+            expected *= max(0.0, float(expected @ seen)) / max(float(expected @ expected), TINY)
         left = seen - expected
         beyond = float(left @ left) - known.noise
         energy = max(float(seen @ seen), known.noise)
@@ -223,23 +230,16 @@ class Residual:
             return False
         for n in MEANS:
             of_mean = sigma_of_mean(sigma, n)
-            is_new = of_mean.tobytes() not in self._known
-            self._conditioned(of_mean)
-            if is_new:
+            if of_mean.tobytes() not in self._known:
+                self._conditioned(of_mean)
                 return True
         return False
 
     def _conditioned(self, sigma: NDArray[np.float32]) -> Conditioned | None:
-        """None where too few measurements count."""
-        key = sigma.tobytes()
-        if key not in self._known:
-            self._known[key] = self._condition(sigma)
-            if len(self._known) > KEPT:
-                self._known.popitem(last=False)
-        self._known.move_to_end(key)
-        return self._known[key]
+        return kept(self._known, sigma.tobytes(), lambda: self._condition(sigma))
 
     def _condition(self, sigma: NDArray[np.float32]) -> Conditioned | None:
+        """None where too few measurements count."""
         live = np.isfinite(sigma)
         if live.sum() < len(sigma) / 4:
             return None
@@ -252,7 +252,7 @@ class Residual:
         )
 
 
-@lru_cache(maxsize=4)
+@cache
 def _means(h: int, w: int, rows: int, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(h, rows) and (columns, w): the mean over the pixels of each coarse one (a product is faster than `mean`)."""
     down = np.repeat(np.eye(h, dtype=np.float32), rows // h, axis=1) * np.float32(h / rows)

@@ -13,7 +13,7 @@ from models.calibration_file import CalibrationFileError, pack, unpack
 from models.measurement.course import TouchCourse
 from models.measurement.fit import FittedScan, TouchFitter
 from models.measurement.numbers import MISFIT, MISFIT_FAR
-from models.measurement.tables import DiscResponse, SkinTables, tables_of
+from models.measurement.tables import SkinTables, tables_of
 from models.measurement.touch import anywhere, plain
 from models.mismatch import Mismatch, MismatchedSheet, mounted, named
 from models.mounted import FieldModes, Mounting, Predicted, most_shift
@@ -102,7 +102,7 @@ def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(skin, bund
 def left_of_touches(tables: SkinTables, z0: np.ndarray) -> float:
     """Median share of a touch's change that the best disc leaves."""
     found, own = [], tables.relative_to(z0)
-    course = TouchCourse(DiscResponse(own), np.zeros(len(z0)), 0.04)
+    course = TouchCourse(own.response, np.zeros(len(z0)), 0.04)
     for x, y in ((0.5, 0.3), (0.2, -0.7), (-0.6, -0.5)):
         seen = np.log(measured(named("mild"), (Shape("circle", x, y, 0.2, 0.3),)) / z0)
         scene, prior = FittedScan(seen, 1e-8 * np.eye(len(z0)), course, own.misfit, len(z0)), anywhere(x, y, 0.0, 0.04)

@@ -10,10 +10,10 @@ from scipy.ndimage import gaussian_filter
 from firmware_stub.world import pressed
 from models.bundle import Bundle
 from models.locator_arrays import LocatorArrays
-from models.measurement.noise import ELSEWHERE, Lines, NoiseModel, in_blocks
-from models.measurement.numbers import EDGE_WIDTH, MISFIT, TYPICAL_RADIUS
+from models.measurement.noise import Lines, NoiseModel, in_blocks
+from models.measurement.numbers import EDGE_WIDTH, ELSEWHERE, MISFIT, TYPICAL_RADIUS
 from models.measurement.response import MeasuredMap
-from models.measurement.tables import FIELD_MODES, DiscResponse, tables_of
+from models.measurement.tables import FIELD_MODES, tables_of
 from models.measurement.touch import EDGE, X, Y
 from models.measurement.whitening import Whitening, leave_out
 from tests.models.solved import action_of, change, log_change, sheet, tables, untouched
@@ -30,7 +30,7 @@ DISCS = (0, 0, 10, 1), (10, 20, 20, 8), (30, 30, 6, 2), (-18, 5, 4, 0.3), (0, 0,
 def test_a_disc_does_what_finite_elements_say(x: float, y: float, radius: float, force: float) -> None:
     touch = pressed("circle", x * 1e-3, y * 1e-3, radius * 1e-3, force)
     there = change(touch)
-    said = action_of(touch) * DiscResponse(tables())(x / 50, y / 50, np.log(radius / 50))
+    said = action_of(touch) * tables().response(x / 50, y / 50, np.log(radius / 50))
     scale = said @ there / (said @ said)
     assert scale == pytest.approx(1, abs=0.03) and off(scale * said, there) < 0.004
 
@@ -47,7 +47,7 @@ def test_drops_of_any_direction_do_what_finite_elements_say(name: str, drop: tup
 
     tensor = np.array([1.0, 0.0, 1.0]) - spot(*sheet().model.centroids.T)[:, None] * drop
     table = getattr(tables(), name)
-    axis = (np.arange(len(table)) + 0.5) * tables().pixel - 1
+    axis = (np.arange(len(table)) + 0.5) * 2 / len(table) - 1
     assert off(np.einsum("yxk,yx->k", table, spot(axis[None, :], axis[:, None])), log_change(tensor)) < 0.02
 
 
@@ -71,7 +71,7 @@ def test_fields_and_contacts_do_what_finite_elements_say() -> None:
 def test_tables_are_relative_to_what_was_measured_up_to_a_common_gain() -> None:
     made, shipped = tables_of(Bundle.load("square16")), Bundle.load("square16")
     assert made.z0 == pytest.approx(shipped.z0) and made.wrong == MISFIT and np.trace(made.misfit) == pytest.approx(1)
-    assert made.inside.shape == made.jacobian.shape[:2] and made.pixel * len(made.jacobian) == 2
+    assert made.inside.shape == made.jacobian.shape[:2]
     other, row = made.z0 * 3.0, np.ones(120)
     other[7], row[7] = other[7] * 1.25, 1 / 1.25
     seen, unlike = made.relative_to(other), made.misfit * np.outer(row, row)
@@ -92,7 +92,7 @@ def test_tables_and_grid_through_a_fault_are_those_of_the_measurements_it_mixes(
     mixes, place = np.eye(120), (0.3, -0.4, np.log(0.2))
     mixes[3, 3], mixes[3, 50], mixes[90, 90] = 0.5, 0.2, 0.0
     seen = tables().through(mixes)
-    assert DiscResponse(seen)(*place) == pytest.approx(mixes @ DiscResponse(tables())(*place), abs=1e-6)
+    assert seen.response(*place) == pytest.approx(mixes @ tables().response(*place), abs=1e-6)
     for name in ("along", "turned"):
         assert_allclose(getattr(seen, name), getattr(tables(), name) @ mixes.T, atol=1e-6)
     for name in ("contact", "series", "field"):
@@ -104,7 +104,7 @@ def test_tables_and_grid_through_a_fault_are_those_of_the_measurements_it_mixes(
 
 def test_slopes_are_differences_of_responses() -> None:
     """A disc's rim runs through pixels, so that both scatter by a tenth of themselves."""
-    response, step, found = DiscResponse(tables()), 0.03, np.empty((16, 3))
+    response, step, found = tables().response, 0.03, np.empty((16, 3))
     for n, (x, y, radius) in enumerate(np.random.default_rng(0).uniform((-0.7, -0.7, 0.12), (0.7, 0.7, 0.4), (16, 3))):
         place = np.array([x, y, np.log(radius)])
         at, *slopes = response.with_slopes(*place)
@@ -116,8 +116,9 @@ def test_slopes_are_differences_of_responses() -> None:
 
 
 def test_a_touchs_own_directions_are_those_of_its_outline_edge_and_tensor() -> None:
-    response, (x, y, radius), bent = DiscResponse(tables()), (0.25, -0.3, 0.35), 0.15
-    side, pixel = len(tables().jacobian), tables().pixel
+    response, (x, y, radius), bent = tables().response, (0.25, -0.3, 0.35), 0.15
+    side = len(tables().jacobian)
+    pixel = 2 / side
     axis = (np.arange(10 * side) + 0.5) * pixel / 10 - 1
     from_x, from_y = axis[None, :] - x, axis[:, None] - y
     angle, distance = np.arctan2(from_y, from_x), np.hypot(from_x, from_y)
@@ -140,7 +141,7 @@ def test_the_grid_tells_a_disc_its_action_and_how_sure_it_is() -> None:
     grid, rng = tables().grid, np.random.default_rng(2)
     covariance = np.diag(rng.uniform(1e-9, 1e-7, 120)) + 1e-8
     white, disc = Whitening.of(covariance), len(grid.discs) // 3
-    response = DiscResponse(tables())(*grid.discs[disc])
+    response = tables().response(*grid.discs[disc])
     information = grid.information(white)
     assert information[disc] == pytest.approx(response @ np.linalg.solve(covariance, response), rel=1e-3)
     z2, found, action = grid.likeliest(np.linalg.solve(covariance, 0.02 * response), information)
@@ -150,7 +151,7 @@ def test_the_grid_tells_a_disc_its_action_and_how_sure_it_is() -> None:
     own = grid.discs[np.isclose(np.exp(grid.discs[:, 2]), 0.18), :2]
     assert np.abs(own).max() == pytest.approx(0.98 - 0.9 * 0.18)  # all over the sheet, nine tenths of it on that
     right = replace(tables(), inside=tables().inside & (np.arange(len(tables().jacobian)) >= 24))
-    assert DiscResponse(right).discs[:, X].min() >= 0 > DiscResponse(right).discs[:, Y].min()
+    assert right.response.discs[:, X].min() >= 0 > right.response.discs[:, Y].min()
 
 
 def measured_map(mean_press: float = 2.0) -> tuple[MeasuredMap, np.ndarray]:
@@ -230,7 +231,7 @@ def test_a_covariance_is_of_white_noise_contacts_and_lines() -> None:
     expected = np.diag(alone) + contact * flicker @ contact.T
     assert_allclose(noise.variances(), alone)
     assert_allclose(noise.covariance(5), expected, atol=1e-18)  # of scans that end otherwise nothing is known yet
-    assert_allclose(noise.covariance(4), expected + noise.disturbing(4) @ noise.disturbing(4).T, atol=1e-18)
+    assert_allclose(noise.covariance(4), expected + noise.lines.columns(4) @ noise.lines.columns(4).T, atol=1e-18)
     assert noise.alike(4) == 4 and noise.alike(5) == 0
     made = in_blocks(np.ones((120, 1)), ORDER[::-1], 3.0)  # as strong within 12 that follow, nothing between
     assert made[119, 108] == made[0, 11] == 9 and made[0, 12] == made[119, 107] == 0
@@ -248,7 +249,7 @@ def test_contact_noise_is_learnt_and_white_noise_is_not_mistaken_for_it() -> Non
     assert np.sqrt(np.delete(noise.now.flicker, [3, 12])).max() < 1e-3
     assert np.sqrt(noise.now.jitter[12]) == pytest.approx(3e-3, rel=0.25)
     assert np.sqrt(np.delete(noise.now.jitter, 12)).max() < 1e-3
-    assert noise.lines.now.part == 0 and not noise.disturbing(0).shape[1]
+    assert noise.lines.now.part == 0 and not noise.lines.columns(0).shape[1]
 
 
 @pytest.mark.parametrize("louder", [0.5, 2.0])
@@ -283,7 +284,7 @@ def test_a_line_of_any_phase_and_pickup_is_learnt_as_what_scans_have_in_common()
     for n, left in enumerate(frames(128)):
         one_by_one.hear(np.linalg.solve(one_by_one.covariance(0), left), 0, False, n * SPAN_S, SPAN_S)
     for noise, most in ((at_once, 1.3), (one_by_one, 1.6)):
-        assert noise.disturbing(0).shape[1] == 2 and noise.disturbing(3).shape[1] == 0
+        assert noise.lines.columns(0).shape[1] == 2 and noise.lines.columns(3).shape[1] == 0
         assert 0.8 < energy(noise, frames(64), 0) < most
     assert energy(NoiseModel(tables()), frames(64), 0) > 3
 
@@ -330,8 +331,8 @@ def test_a_line_that_is_learnt_of_scans_that_end_with_one_part_is_known_of_all_o
         noise.lines.ordered(3, (order - 36) % 120)
         noise.lines.ordered(4, np.roll(order, 1)[::-1])  # parts were lost: its scans are no two of those
         assert 0.8 < energy(noise, disturbed(64, newer, sweeps), 3) < most
-        assert noise.disturbing(4).shape[1] == 0
+        assert noise.lines.columns(4).shape[1] == 0
         if not sweeps:
             assert np.linalg.svd(noise.lines.now.turn)[1].min() > 0.9
-            alone, together = (noise.disturbing(part) @ noise.disturbing(part).T for part in (10, 3))
+            alone, together = (noise.lines.columns(part) @ noise.lines.columns(part).T for part in (10, 3))
             assert_allclose(np.diag(together), np.diag(alone), rtol=1e-6)

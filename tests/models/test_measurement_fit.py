@@ -15,8 +15,7 @@ from models.measurement import touch as touches
 from models.measurement.course import TouchCourse
 from models.measurement.fit import FittedScan, TouchFitter
 from models.measurement.noise import NoiseModel
-from models.measurement.response import DiscGrid
-from models.measurement.tables import DiscResponse, SkinTables, tables_of
+from models.measurement.tables import SkinTables, tables_of
 from models.measurement.touch import ACTION, PLACE, RATE, VX, TouchPrior, X, Y, anywhere, plain
 from models.measurement.whitening import Whitening
 from models.response_tables import response_tables
@@ -231,9 +230,9 @@ def disc_tables(folder: Path, pattern: str, fine: bool) -> SkinTables:
 @pytest.mark.parametrize(("pattern", "fine"), MOST)
 def test_a_press_is_explained_by_its_disc_and_found_where_it_is(tmp_path: Path, pattern: str, fine: bool) -> None:
     known, rng = disc_tables(tmp_path, pattern, fine), np.random.default_rng(3)
-    response, k = DiscResponse(known), known.measurements
+    response, k = known.response, known.measurements
     covariance, times_s = NoiseModel(known).covariance(0), ((np.arange(k) + 0.5) / k - 0.5) * SHORT_S
-    grid, white = DiscGrid(response), Whitening.of(covariance)
+    grid, white = known.grid, Whitening.of(covariance)
     assert np.hypot(*grid.discs[:, :2].T).max() < 1.05 and (np.abs(grid.responses).max(axis=1) > 0).all()
     for (x, y), most in zip(PLACES, MOST[pattern, fine], strict=True):
         touch = Shape("circle", x, y, 0.2, 0.4)

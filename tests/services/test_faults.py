@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from firmware_stub.analog import Analog, BoardNoise
 from firmware_stub.faults import FAULTS, MUXES, Faults
-from models.measurement.response import DiscGrid
-from models.measurement.tables import DiscResponse, SkinTables, tables_of
+from models.measurement.tables import SkinTables, tables_of
 from models.measurement.whitening import Whitening
 from models.patterns import adjacent, pairs
 from models.shapes import Shape
@@ -177,7 +176,7 @@ def test_patterns_that_do_not_drive_the_wires_tell_nothing_of_them() -> None:
 
 @pytest.mark.parametrize(("faults", "fault"), [exchanged((1, 2)), short((4, 13)), *STUCK[::5]])
 def test_a_fault_is_told_by_one_scan_whatever_touches_and_also_where_it_begins_or_ends_within(faults, fault) -> None:
-    late, every_touch = 0.05 * SPAN_S <= MEASURED_S, any_touches(DiscGrid(DiscResponse(tables())))
+    late, every_touch = 0.05 * SPAN_S <= MEASURED_S, any_touches(tables().grid)
     for touch in TOUCHES:
         well, ill = measured({}, touch), measured(faults, touch)
         lower = 0.8 * well[0], well[1]

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from models.measurement.course import SUDDEN_STEPS, TURN_STEPS, TouchCourse
 from models.measurement.fit import LEAST_MEAN, FittedScan, KnownWhitening, TouchFitter, Turned
 from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
-from models.measurement.numbers import LEAST_ACTION, MISFIT_WIDE
+from models.measurement.numbers import AT_ONCE_S, LEAST_ACTION, MISFIT_WIDE
 from models.measurement.tables import SkinTables
 from models.measurement.touch import (
     ACTION,
-    AT_ONCE_S,
     LOG_RADIUS,
     PLACE,
     RATE,
@@ -313,7 +312,7 @@ class Hypotheses:
         if cause == MEMORY:
             return self._drift.more_memory()
         if cause == BURST:
-            lines = self._noise.disturbing(innovation.scan.part)
+            lines = self._noise.lines.columns(innovation.scan.part)
             return in_blocks(lines, innovation.order, n.BURST) if lines.shape[1] else None
         block = innovation.order // BURST_BLOCK  # each block of measurements with a noise of its own
         count = np.bincount(block)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.numbers import LINE_SCANS
 from models.measurement.touch import anywhere
 from models.measurement.whitening import Whitening
 from services.estimation.faults.board import BoardView
@@ -54,7 +55,7 @@ class HypothesisSelection:
         """Of a view of the scan; covariance (K, K): of its y."""
         skin, known, wire = self.skin, self.skin.grid_information, self.skin.faults.now.wire
         same = known is not None and np.array_equal(known.live, view.live) and known.wire == wire
-        if known is None or not same or self.wholes - known.wholes >= n.LINE_SCANS:
+        if known is None or not same or self.wholes - known.wholes >= LINE_SCANS:
             each = hypotheses.grid.information(Whitening.of(covariance))
             known = skin.grid_information = GridInformation(each, self.wholes, view.live, wire)
         candidates = tuple(candidate.begun(self.measured) for candidate in self.left_open)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from models.measurement.numbers import LEAST_NOISE
 from models.prereconstruction import PreReconstructor, noise_of_frames
 from protocol.errors import EitskinError
 from services.estimation.values import numbers
@@ -27,7 +28,6 @@ UNLIKE = 0.12  # rms relative misfit: columns in another order, another unit or 
 SEE = "see that the skin, the order of columns and the unit are those measured, and that no electrode is open"
 REPEATED = 0.1  # of the values that equal the row before: noise of a third of a step gives 0.65, of 4 steps 0.07
 COARSE = 2e-3  # relative step of |Z|: by 9 bits touches of 1 N are placed 4 to 15 mm off, by 10 bits 2 at most
-LEAST_NOISE = 2e-6  # relative: about half a step of the board's 18 bits
 
 
 class NoBaseline(EitskinError, ValueError):

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.numbers import LEAST_NOISE, MEDIAN_DEVIATION
 from models.prereconstruction import PreReconstructor, shrunk
-from services.estimation.initialisation.baseline import LEAST_NOISE, SEE, Baseline, in_proportion, unlike
+from services.estimation.initialisation.baseline import SEE, Baseline, in_proportion, unlike
 from services.estimation.values import numbers
 from services.estimation.values.state import shaped
 
@@ -124,7 +125,7 @@ def _noise(reference: Array) -> Array:
     for half in (slice(0, None, 2), slice(1, None, 2)):
         nearest = _nearest(np.nan_to_num(np.delete(form, np.arange(k)[half], axis=1)), few)
         apart = np.abs(form[:, None, half] - form[:, half][nearest])
-        own[half] = np.nanmedian(apart, axis=(0, 1)) / 0.6745 / np.sqrt(2)
+        own[half] = np.nanmedian(apart, axis=(0, 1)) / MEDIAN_DEVIATION / np.sqrt(2)
     typical = np.nanmedian(np.where(own > 0, own, np.nan))
     if not np.isfinite(typical):
         return np.full(k, numbers.TARE_ASSUMED)

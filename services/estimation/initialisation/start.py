@@ -34,6 +34,7 @@ from services.estimation.values.estimate import Judgement, Verdict, judge
 Array = NDArray[np.float64]
 
 LADDER: Array = 2.0 ** np.arange(n.START_RUNGS)  # of the difference between bundle and skin
+ANY_GAIN = 1.0  # variance of the log of an unknown board's gain
 COARSE = 12  # pixels along each side of the sheet, that a smooth field is made of
 SPAN_S = 1.0  # of a mean of scans, in which nothing changes: any
 STEADY_SD = 1e-6  # of rates and velocities of a touch that lasts through all scans
@@ -105,7 +106,7 @@ class TouchAtStartTest:
         gain = float(np.median(y[live]))
         y = np.where(live, y - gain, 0.0)
         tables = self._tables.relative_to(np.exp(log_expected + gain))
-        base = np.diag(variance + n.START_ABSOLUTE**2) + n.START_GAIN**2
+        base = np.diag(variance + n.START_ABSOLUTE**2) + ANY_GAIN
         leave_out(base, live)
         ladder = StartLadder(tables, y, live)
         if earlier is not None:
@@ -173,12 +174,12 @@ class StartLadder:
 
 
 def smooth_field(tables: SkinTables) -> Array:
-    """(K, K) covariance of what a smooth random log conductivity of unit variance does."""
+    """(K, K) covariance of what a random log conductivity of unit variance does that is smooth over 1 unit."""
     side = len(tables.jacobian)
     block = side // gcd(side, COARSE)
     coarse = tables.jacobian.reshape(side // block, block, side // block, block, -1).sum(axis=(1, 3)).astype(float)
     axis = (np.arange(len(coarse)) + 0.5) * 2 / len(coarse) - 1
-    near = np.exp(-((axis[:, None] - axis) ** 2) / (2 * n.START_FIELD_LENGTH**2))
+    near = np.exp(-((axis[:, None] - axis) ** 2) / 2)
     smoothed = np.einsum("ab,bck->ack", near, np.einsum("cd,bdk->bck", near, coarse))
     return np.asarray(np.einsum("yxk,yxl->kl", coarse, smoothed, optimize=True))
 
@@ -220,7 +221,7 @@ class WiringTest:
         """(K, K) of log |Z| over what a skin and its bundle differ by, of each size, and touches anywhere."""
         tables = self._tables
         contact = tables.contact * n.START_CONTACT
-        base = contact @ contact.T + n.START_GAIN**2 + any_touches(tables.grid)
+        base = contact @ contact.T + ANY_GAIN + any_touches(tables.grid)
         base += n.START_FIELD**2 * smooth_field(tables) + n.START_GRAIN**2 * grain(tables)
         form = bundle_misfit(tables)
         return [base + times**2 * form for times in LADDER]

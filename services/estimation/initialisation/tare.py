@@ -11,11 +11,11 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.numbers import LEAST_NOISE
 from models.measurement.tables import FIELD_DEGREES, SkinTables
 from models.prereconstruction import shrunk
 from services.estimation.faults.wires import WireFault, WireKind
 from services.estimation.initialisation.baseline import (
-    LEAST_NOISE,
     NoBaseline,
     agreement,
     identical,
@@ -166,7 +166,7 @@ def without_drift(scans: Array, field: Array) -> Array:
     slope = np.linspace(-1, 1, len(scans))
     each = slope @ (scans - scans.mean(axis=0)) / (slope @ slope)
     drift = np.linalg.lstsq(field, each, rcond=None)[0]
-    drift *= min(1.0, n.TARE_DRIFTS / max(float(np.linalg.norm(drift)), 1e-12))
+    drift *= n.TARE_DRIFTS / max(float(np.linalg.norm(drift)), n.TARE_DRIFTS)
     return np.asarray(scans - slope[:, None] * (field @ drift))
 
 

@@ -55,7 +55,7 @@ STILL_SCANS = Number(3.0, "-", "scans without motion or change, after which a to
 PLACE_WALK = Number(0.003, "unit", "place of one that stays, from scan to scan", "derived: a third of STILL_WAY")
 STAYS_WITHIN = Number(2.5, "-", "sigmas that one which stays is off at most", "derived: one scan of 25")
 STILL_WAY = Number(0.01, "unit", "way within a scan of one that stays", "derived: 0.5 mm, 12 mm/s")
-STILL_CHANGE = Number(0.1, "-", "change of its action within a scan", "derived: as the kinks' threshold")
+STILL_CHANGE = Number(0.1, "-", "change of its action within a scan", "derived: CHANGES")
 RADIUS_WALK = Number(0.05, "-", "log radius from scan to scan", "chosen: a finger that rolls")
 SHAPE_WALK = Number(0.3, "-", "of what shapes differ by, from scan to scan", "chosen: a finger that rolls")
 SLIDES = Number(1.5, "unit/s", "velocity of a touch of which nothing is known", "derived: 75 mm/s, one sigma")
@@ -95,9 +95,7 @@ MOST_ADRIFT = Number(1e4, "-", "at most, of its variance", "derived: ten per cen
 """What may explain a scan: log priors, and the budget."""
 
 START_RUNGS = Number(9.0, "-", "sizes of a difference between skin and bundle", "derived: up to 256 times the least")
-START_GAIN = Number(1.0, "-", "log of an unknown board's gain", "chosen: free")
-START_FIELD = Number(0.05, "-", "log conductivity of an unknown sheet, uneven", "chosen: sheets dry by 5 %")
-START_FIELD_LENGTH = Number(1.0, "unit", "over which it is even", "chosen: half a side")
+START_FIELD = Number(0.05, "-", "log conductivity of an unknown sheet, even over 1 unit", "chosen: sheets dry by 5 %")
 START_GRAIN = Number(0.05, "-", "by which it conducts better one way", "derived: as START_FIELD")
 START_CONTACT = Number(0.3, "-", "a contact impedance of an unknown skin", "derived: as the networks were trained")
 START_SERIES = Number(0.03, "-", "a contact's part in series, against its rest", "measured: trust --plan drift")
@@ -138,7 +136,7 @@ SLOW_EVERY_S = Number(1.0, "s", "from look to look for one", "chosen: cost, 4 ms
 SLOW_TIMES = Number(400.0, "-", "times FIELD_FASTER^2: drift meanwhile", "derived: contacts 4 %, 5 times CONTACT_RATE")
 CHANGING_S = Number(0.1, "s", "for which what nothing explains is said to be changing", "derived: two whole scans")
 LOST_S = Number(1.0, "s", "for which a skin or a gain was another, until that is taken over", "derived: half of 2 s")
-LOST_SCANS = Number(8.0, "-", "whole scans from search to search then", "chosen: cost, three searches a second")
+LOST_SCANS = Number(8.0, "-", "whole scans from search to search then", "derived: TARE_RETRIES, three a second")
 GAP_S = Number(0.13, "s", "without a scan, after which touches may be anywhere", "derived: three whole scans")
 DOUBT_Z2 = Number(400.0, "-", "z^2 of a touch that every whole scan asks whether it is drift", "derived: 20 sigmas")
 DOUBT_SCANS = Number(10.0, "-", "whole scans after which every touch is asked that", "derived: twice a second")
@@ -146,7 +144,6 @@ ODD_OUTLINE = Number(12.0, "-", "squared sigmas of an outline that may be severa
 ODDER = Number(1.5, "-", "times as odd as when it was asked last: it is asked again", "chosen: cost")
 SURE_SCANS = Number(2.0, "-", "whole scans that need a weak touch, after which it is shown", "derived: a chance twice")
 LEAST_LIVE = Number(0.5, "-", "share of the measurements that must count", "chosen: half, to see a touch anywhere")
-LINE_SCANS = Number(100.0, "-", "untouched scans after which lines are made anew", "derived: half of LEARNING_LINES")
 """The way of one scan."""
 
 SHORT_OHM = Number(1e-3, "ohm", "between electrodes whose wires touch, of a sheet of 1 S", "chosen: any small one")

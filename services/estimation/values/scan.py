@@ -8,11 +8,12 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.numbers import SCAN_S
 from protocol.frames import RawFrame, as_sent
 
 Array = NDArray[np.float64]
 
-SCAN_S = 0.0437  # a whole scan of 120 measurements: where a board's clock says nothing yet
+US, PER_S = 1e-6, 1e6  # of a board's clock [s, 1/s]
 SHORTEST_S, LONGEST_S = 0.005, 2.0  # of a scan that any board measures
 
 
@@ -48,17 +49,17 @@ class Scan:
         """
         count = len(frame.z)
         if frame.parts > 1:
-            ages_s = frame.age_us.astype(float) * 1e-6
+            ages_s = frame.age_us.astype(float) * US
             newest_s, duration_s = _spanned_s(ages_s[frame.new != 0]), _spanned_s(ages_s)
         else:
             duration_s = newest_s = _duration_s(frame, before)
             ages_s = duration_s * (1 - (np.arange(count) + 0.5) / max(count, 1))
-        end_us = frame.device_us + 1e6 * newest_s
+        end_us = frame.device_us + PER_S * newest_s
         sample_ns = frame.stamps.get("sample", 0)
         valid, reasons = as_sent(frame)  # measurements that failed are left out
         new = np.ones(count, bool)
         if before is not None and before.board == frame.board and end_us > before.end_us:
-            new = end_us - 1e6 * ages_s > before.end_us
+            new = end_us - PER_S * ages_s > before.end_us
         return cls(
             values=np.abs(frame.z.astype(np.complex128)),
             ages_s=ages_s,
@@ -67,7 +68,7 @@ class Scan:
             number=frame.scan,
             part=frame.part,
             end_us=end_us,
-            at_ns=sample_ns + round(0.5e9 * newest_s),
+            at_ns=sample_ns + round(newest_s / 2 * 1e9),
             sample_ns=sample_ns,
             duration_s=duration_s,
             board=frame.board,
@@ -88,7 +89,7 @@ def _spanned_s(ages_s: Array) -> float:
 def _duration_s(frame: RawFrame, before: Scan | None) -> float:
     """Of a whole scan: what passed since the one before it, as boards measure one after the other."""
     if before is None or before.part:
-        return SCAN_S
-    passed_s = (frame.device_us - before.end_us) * 1e-6 + before.duration_s
+        return float(SCAN_S)  # a board's clock says nothing yet
+    passed_s = (frame.device_us - before.end_us) * US + before.duration_s
     follows = frame.scan == before.number + 1 and SHORTEST_S < passed_s < LONGEST_S
     return passed_s if follows else before.duration_s

@@ -33,18 +33,9 @@ def saved(state: Any) -> Any:
         return [[saved(key), saved(value)] for key, value in state.items()]
     if isinstance(state, (list, tuple)):
         return [saved(each) for each in state]
-    return _plain(state)
-
-
-def _plain(value: Any) -> Any:
-    """A number of a further type, NumPy's or a subclass, as Python's own; else what it is."""
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, int):
-        return int(value)
-    return float(value) if isinstance(value, float) else value
+    if isinstance(state, np.generic):
+        return state.item()
+    return next((kind(state) for kind in (bool, int, float) if isinstance(state, kind)), state)
 
 
 def loaded(kind: type[T], found: Any, sizes: Sizes) -> T:
