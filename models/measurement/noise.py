@@ -30,11 +30,9 @@ from models.measurement.whitening import Whitening
 Array = NDArray[np.float64]
 Order = NDArray[np.intp]
 
+TINY = np.finfo(float).tiny
 BURST_BLOCK = int(n.BURST_BLOCK)
 ROUNDS = 10  # of learning from the frames of a tare
-STEADY_CONTACTS = 40  # measurements whose contacts are quiet enough to tell the white noise
-
-
 FIRST_LINES = (16, 32, 64)  # scans heard, at which lines are made for the first times
 FOLLOWS = 1.5  # scans: one that comes no later than that after another follows it
 
@@ -186,7 +184,7 @@ class NoiseModel:
     def __init__(self, tables: SkinTables) -> None:
         self._contact = tables.contact
         self._squares = tables.contact**2
-        self._weight = np.maximum((self._squares**2).sum(axis=0), 1e-12)
+        self._weight = np.maximum((self._squares**2).sum(axis=0), TINY)
         e = tables.electrodes
         self.now = NoiseState(float(n.WHITE**2), np.full(e, n.FLICKER_FLOOR**2), np.zeros(e))
         self.lines = Lines(tables.measurements)
@@ -229,7 +227,7 @@ class NoiseModel:
         self._follow_contacts(weighted_residual[None], white, n.LEARNING)
         excess = self._excess(weighted_residual, white.conditional_precisions())
         steady = self._squares @ self.now.jitter < 0.2 * self.now.white
-        if steady.sum() >= STEADY_CONTACTS:
+        if steady.any():
             change = n.LEARNING_WHITE * float(excess[steady].mean())
             self.now.white = float(np.clip(self.now.white + change, 0.8 * self.now.white, 1.25 * self.now.white))
 
@@ -254,7 +252,7 @@ class NoiseModel:
         n its information.
         """
         columns = white(self._contact)
-        information = np.maximum((columns**2).sum(axis=0), 1e-12)
+        information = np.maximum((columns**2).sum(axis=0), TINY)
         moved = (weighted_residual @ self._contact / information) ** 2
         flicker = (
             np.minimum(moved, n.OUTLIER / information + n.OUTLIER * self.now.flicker).mean(axis=0) - 1 / information

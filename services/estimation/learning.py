@@ -58,8 +58,6 @@ class DelayedUpdate:
     def catch_up(self) -> None:
         """Takes longer than a look at a quiet scan: what is said of a scan does not wait for it."""
         waiting = self.now.waiting
-        if waiting and waiting[-1].drifts > 1:  # the filter was lost: what explains this scan now is the skin
-            self._update(waiting.pop())
         if len(waiting) > n.LAG_SCANS:
             self._update(waiting.pop(0))
 

@@ -11,7 +11,6 @@ from models.measurement.touch import LOG_RADIUS
 from services.estimation.filter import Memory
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer, started
 from services.estimation.tared import TaredSkin
-from services.estimation.touches import TouchTracks
 from services.estimation.track import TrackedTouch
 from services.estimation.values import numbers as n
 
@@ -93,17 +92,11 @@ def _doubt(skin: TaredSkin, innovation: Innovation, answer: ScoredAnswer, measur
         if other.quiet and other.score > answer.score + least and touches.stay(other.fit, other.association):
             none.append((other.score - least, k))
         elif not track.confirmed and not skin.faults.in_question(track.state):
-            track.confirmed = _needed(track, touches, answer, other, strange)
+            track.confirmed = _acts(track, alone=len(touches) == 1) and not strange
     if none:
         touches.remove(max(none)[1])
 
 
-def _needed(
-    track: TrackedTouch, touches: TouchTracks, answer: ScoredAnswer, other: ScoredAnswer, strange: bool
-) -> bool:
-    """Whether several scans need a touch, or this one a touch that nobody saw begin. other: without it."""
-    acts, alone = track.z2 > n.ACTS_Z2, len(touches) == 1  # alone: something touches, be its strength known or not
-    if track.scans >= n.SURE_SCANS and (alone or acts) and not strange:
-        return True
-    needs = answer.explained and answer.cause == AS_IT_IS and 2 * (answer.score - other.score) > n.SURE_Z2
-    return acts and not touches.now.watched and needs
+def _acts(track: TrackedTouch, alone: bool) -> bool:
+    """Whether several scans need a touch. alone: something touches, be its strength known or not."""
+    return track.scans >= n.SURE_SCANS and (alone or track.z2 > n.ACTS_Z2)

@@ -111,10 +111,8 @@ class TouchAtStartTest:
         ladder = StartLadder(tables, y, live)
         if earlier is not None:
             return decided(ladder.rungs(base + earlier.covariance, n.START_ABSOLUTE**2 * np.eye(len(y)), 0.0))
-        contact = tables.contact * n.START_CONTACT
-        base += contact @ contact.T
-        form = bundle_misfit(tables)
-        wide = base + n.START_FIELD**2 * smooth_field(tables) + n.START_GRAIN**2 * grain(tables)
+        base += contacts(tables)
+        form, wide = bundle_misfit(tables), uneven(tables, base)
         return decided(ladder.rungs(base, form, 0.0) + ladder.rungs(wide, form, float(n.START_COST_WIDE)))
 
 
@@ -134,24 +132,18 @@ class StartLadder:
         covariances = [base + times**2 * form for times in LADDER]
         whites = [Whitening.of(covariance) for covariance in covariances]
         density = [white.log_likelihood(self._y) for white in whites]
-        last = min(len(LADDER), int(np.argmax(density)) + 2)
         found, touched, most = list[Rung](), -np.inf, -np.inf
-        for k in range(last):
-            past = touched < most - n.START_PAST
-            found.append(self._rung(float(LADDER[k]), covariances[k], whites[k], density[k], cost, past))
-            touched = found[-1].touched
+        for k, times in enumerate(LADDER[: int(np.argmax(density)) + 2]):
+            log_prior = cost - float(np.log(times))  # the larger, the less likely
+            information = self._grid.information(whites[k])
+            least = float(n.START_SEEN**2 * np.quantile(information, n.START_SEEN_SHARE))
+            scene = FittedScan(self._y, covariances[k], self._course, self._misfit, int(self._live.sum()))
+            past = touched < most - n.START_PAST  # no touch is worth looking for any more
+            fit = None if past else self._touched(scene, whites[k], information)
+            touched = -np.inf if fit is None else fit.evidence + n.LOG_PRIOR_TOUCH * len(fit) + log_prior
             most = max(most, touched)
+            found.append(Rung(float(times), cost == 0, density[k] + log_prior, touched, least, fit))
         return found
-
-    def _rung(self, times: float, covariance: Array, white: Whitening, density: float, cost: float, past: bool) -> Rung:
-        """past: whether no touch is worth looking for any more."""
-        log_prior = cost - float(np.log(times))  # the larger, the less likely
-        information = self._grid.information(white)
-        least = float(n.START_SEEN**2 * np.quantile(information, n.START_SEEN_SHARE))
-        scene = FittedScan(self._y, covariance, self._course, self._misfit, int(self._live.sum()))
-        fit = None if past else self._touched(scene, white, information)
-        touched = -np.inf if fit is None else fit.evidence + n.LOG_PRIOR_TOUCH * len(fit) + log_prior
-        return Rung(times, cost == 0, density + log_prior, touched, least, fit)
 
     def _touched(self, scene: FittedScan, white: Whitening, information: NDArray[np.float32]) -> FoundTouches | None:
         """Touches one after the other, each found as a disc, while they add evidence."""
@@ -173,21 +165,25 @@ class StartLadder:
         return best
 
 
-def smooth_field(tables: SkinTables) -> Array:
-    """(K, K) covariance of what a random log conductivity of unit variance does that is smooth over 1 unit."""
+def contacts(tables: SkinTables) -> Array:
+    """(K, K) covariance of what an unknown skin's contact impedances do."""
+    contact = tables.contact * n.START_CONTACT
+    return np.asarray(contact @ contact.T)
+
+
+def uneven(tables: SkinTables, even: Array) -> Array:
+    """(K, K) covariance of a sheet whose log conductivity is any that is smooth over 1 unit, and which conducts better
+    one way than across it, where that is known; even (K, K): of one that is even.
+    """
     side = len(tables.jacobian)
     block = side // gcd(side, COARSE)
     coarse = tables.jacobian.reshape(side // block, block, side // block, block, -1).sum(axis=(1, 3)).astype(float)
     axis = (np.arange(len(coarse)) + 0.5) * 2 / len(coarse) - 1
     near = np.exp(-((axis[:, None] - axis) ** 2) / 2)
     smoothed = np.einsum("ab,bck->ack", near, np.einsum("cd,bdk->bck", near, coarse))
-    return np.asarray(np.einsum("yxk,yxl->kl", coarse, smoothed, optimize=True))
-
-
-def grain(tables: SkinTables) -> Array:
-    """(K, K) covariance of what a sheet does that conducts better one way than across it; zero where unknown."""
-    columns = np.stack([tables.along.sum(axis=(0, 1)), tables.turned.sum(axis=(0, 1))], axis=1).astype(float)
-    return np.asarray(columns @ columns.T)
+    grain = np.stack([tables.along.sum(axis=(0, 1)), tables.turned.sum(axis=(0, 1))], axis=1).astype(float)
+    field = np.einsum("yxk,yxl->kl", coarse, smoothed, optimize=True)
+    return np.asarray(even + n.START_FIELD**2 * field + n.START_GRAIN**2 * (grain @ grain.T))
 
 
 def bundle_misfit(tables: SkinTables) -> Array:
@@ -203,7 +199,7 @@ def decided(rungs: list[Rung]) -> JudgedStart:
     bare = rungs[int(untouched.argmax())]
     best = rungs[int(touched.argmax())]
     if odds > n.START_NATS and best.fit is not None:
-        sure = best.even and best.times <= n.START_SURE and best.fit.chi2 < n.START_SURE_CHI2
+        sure = best.even and best.times <= n.START_SURE
         return JudgedStart(StartSays.TOUCHED, odds, sure, bare, best.fit)
     says = StartSays.UNTOUCHED if odds < 0 and bare.seen > n.FALSE_ALARM_Z2 else StartSays.UNKNOWN
     return JudgedStart(says, odds, False, bare, None)
@@ -220,9 +216,7 @@ class WiringTest:
     def _covariances(self) -> list[Array]:
         """(K, K) of log |Z| over what a skin and its bundle differ by, of each size, and touches anywhere."""
         tables = self._tables
-        contact = tables.contact * n.START_CONTACT
-        base = contact @ contact.T + ANY_GAIN + any_touches(tables.grid)
-        base += n.START_FIELD**2 * smooth_field(tables) + n.START_GRAIN**2 * grain(tables)
+        base = uneven(tables, contacts(tables) + ANY_GAIN + any_touches(tables.grid))
         form = bundle_misfit(tables)
         return [base + times**2 * form for times in LADDER]
 

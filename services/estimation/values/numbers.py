@@ -107,7 +107,6 @@ START_PAST = Number(10.0, "nat", "of a touch's evidence lost, beyond which none 
 START_TOUCHES = Number(3.0, "-", "touches at a start at most", "chosen: as networks were trained")
 START_NATS = Number(30.0, "nat", "by which a touch explains the first scans better", "measured: tests of the start")
 START_SURE = Number(16.0, "-", "times the least difference beside which a touch is sure", "measured: as START_NATS")
-START_SURE_CHI2 = Number(3.0, "-", "chi^2 a measurement that such a touch leaves at most", "measured: as START_NATS")
 """What a skin may be before its first baseline."""
 
 TARE_SCANS = Number(64.0, "-", "scans of a baseline", "derived: an eighth of one scan's noise")
