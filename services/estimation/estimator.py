@@ -20,7 +20,7 @@ from services.estimation.scan_step import EstimatorState, ScanStep
 from services.estimation.tared import KnownBaseline, TaredSkin, TaredState
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, Judgement, judge
-from services.estimation.values.scan import Scan
+from services.estimation.values.scan import NS, PER_S, Scan
 from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
@@ -139,7 +139,7 @@ class Estimator:
         """What touches, by this scan and those before it."""
         self.learn()
         before, self.now.before = self.now.before, scan
-        gap_s = 0.0 if before is None else (scan.at_ns - before.at_ns) * 1e-9
+        gap_s = 0.0 if before is None else (scan.at_ns - before.at_ns) * NS
         measured = self._prepared(scan)
         judgements = [judge("believed", float(not scan.believed), 1.0)]
         judgements += self.taring.judgements(self.skin is not None)
@@ -150,7 +150,7 @@ class Estimator:
 
     def _prepared(self, scan: Scan) -> Observation:
         """A scan as it is observed; a whole one may be one of a baseline."""
-        now, oldest_us = self.now, scan.end_us - 1e6 * scan.duration_s
+        now, oldest_us = self.now, scan.end_us - PER_S * scan.duration_s
         whole = not scan.part or oldest_us >= now.whole_us - 1.0 or scan.end_us < now.whole_us
         measurable = np.isfinite(scan.values) & (scan.values > 0) & (scan.status == 0)
         live = measurable if self.skin is None else measurable & self.skin.live

@@ -103,21 +103,22 @@ def take(frames: Array, pre: PreReconstructor, board: str) -> Baseline:
     return Baseline(z0, sigma, len(frames), board, 0, doubt)
 
 
+def percent(share: float, digits: int = 1) -> str:
+    return f"{share:.{digits}%}".replace("%", " %")
+
+
 def measured(log_z: Array) -> tuple[NDArray[np.bool_], float]:
     """(K,) which measurements of (N, K) log |Z| every frame has, in some proportion to the others, and their relative
     noise. Raises NoBaseline where those are too few, or scatter by too much.
     """
     live = in_proportion(log_z)
     if live.mean() < numbers.LEAST_LIVE:
-        raise NoBaseline(
-            f"only {int(live.sum())} of {len(live)} measurements give values: check the cable and the electrodes"
-        )
+        few = f"only {int(live.sum())} of {len(live)} measurements give values"
+        raise NoBaseline(f"{few}: check the cable and the electrodes")
     noise = float(np.median(log_z[:, live].std(axis=0, ddof=1)))
     if noise > numbers.TARE_NOISY:
-        raise NoBaseline(
-            f"the frames scatter by {100 * noise:.1f} % (at most {100 * numbers.TARE_NOISY:.0f} %): "
-            "check grounding and cable"
-        )
+        most = percent(numbers.TARE_NOISY, 0)
+        raise NoBaseline(f"the frames scatter by {percent(noise)} (at most {most}): check grounding and cable")
     return live, noise
 
 
@@ -131,10 +132,8 @@ def identical(count: int) -> str:
 
 def untrained(noise: float) -> str:
     """Why no network is to be believed beside this relative noise, to a person."""
-    return (
-        f"the frames scatter by {100 * noise:.1f} %, networks were trained for {100 * numbers.TARE_UNTRAINED:.2f} % at "
-        "most: check grounding and cable, then run `skin tare`"
-    )
+    trained = f"networks were trained for {percent(numbers.TARE_UNTRAINED, 2)} at most"
+    return f"the frames scatter by {percent(noise)}, {trained}: check grounding and cable, then run `skin tare`"
 
 
 def plausible_noise(z0: Array, sigma: Array) -> Array:
@@ -215,7 +214,7 @@ def unlike(z0: Array, sigma: Array, pre: PreReconstructor) -> str:
     known = np.isfinite(sigma) & (z0 > 0)
     noise = float(np.sqrt(np.mean((sigma[known] / z0[known]) ** 2))) if known.any() else 0.0
     misfit = implausibility(z0, pre)
-    return f"{100 * misfit:.1f} % off what the bundle predicts" if misfit > np.hypot(UNLIKE, noise) else ""
+    return f"{percent(misfit)} off what the bundle predicts" if misfit > np.hypot(UNLIKE, noise) else ""
 
 
 def in_proportion(log_z: Array) -> NDArray[np.bool_]:
