@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, laplace
 
 from models.locator_arrays import LocatorArrays
 from models.measurement import numbers as n
@@ -100,12 +100,7 @@ class DiscResponse:
 
     def _edge(self, at: Covered) -> Array:
         """A blur of variance w^2 adds w^2 / 2 times the Laplacian."""
-        bent = -4 * at.share
-        bent[1:] += at.share[:-1]
-        bent[:-1] += at.share[1:]
-        bent[:, 1:] += at.share[:, :-1]
-        bent[:, :-1] += at.share[:, 1:]
-        return 0.5 * (n.EDGE_WIDTH / self._pixel) ** 2 * bent
+        return np.asarray(0.5 * (n.EDGE_WIDTH / self._pixel) ** 2 * laplace(at.share, mode="constant"))
 
     def _sum(self, table: NDArray[np.float32], at: Covered, weights: Array) -> Array:
         """(c, K) of weights (c, n, m)."""
@@ -166,9 +161,9 @@ class MeasuredMap:
     def with_slopes(self, x: float, y: float, log_radius: float) -> Array:
         """(4, K): response, its slopes to x and y, and 0 for the radius."""
         rows, columns = self._table.shape[1:3]
-        across = np.clip((x - self._corner[0]) / self._spacing, 0, columns - 1.001)
-        along = np.clip((y - self._corner[1]) / self._spacing, 0, rows - 1.001)
-        ix, iy = int(across), int(along)
+        across = np.clip((x - self._corner[0]) / self._spacing, 0, columns - 1)
+        along = np.clip((y - self._corner[1]) / self._spacing, 0, rows - 1)
+        ix, iy = min(int(across), columns - 2), min(int(along), rows - 2)
         u, v = across - ix, along - iy
         block = self._table[:, iy : iy + 2, ix : ix + 2]
         weight = np.array([[(1 - u) * (1 - v), u * (1 - v)], [(1 - u) * v, u * v]])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.measurement.numbers import TINY
 from models.prereconstruction import Drift, Operator, PreReconstructor
+from services.estimation.values.numbers import LEAST_LIVE
 from services.estimation.values.state import shaped
 
 Array = NDArray[np.float64]
@@ -241,7 +242,7 @@ class Residual:
     def _condition(self, sigma: NDArray[np.float32]) -> Conditioned | None:
         """None where too few measurements count."""
         live = np.isfinite(sigma)
-        if live.sum() < len(sigma) / 4:
+        if live.mean() < LEAST_LIVE:
             return None
         operator = self.pre.condition(sigma.astype(float), drift=DRIFT, weights=live.astype(float))
         count = int(live.sum())

@@ -6,12 +6,12 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import asdict, dataclass
-from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.special import chdtri
 
 from models.measurement.numbers import LEAST_NOISE
 from models.prereconstruction import PreReconstructor, noise_of_frames
@@ -191,10 +191,7 @@ def agreement(scans: Array) -> Agreement:
     means = parts.mean(axis=1)
     statistic = float((((means - means.mean(axis=0)) ** 2).sum(axis=0) / within).sum())
     dof_within = quarters * (size - 1)
-    dof = (quarters - 1) * scans.shape[1]
-    quantile = NormalDist().inv_cdf(1 - numbers.TARE_DISAGREES)
-    spread = 2 / (9 * dof)
-    chi_square = dof * (1 - spread + quantile * spread**0.5) ** 3  # Wilson-Hilferty
+    chi_square = chdtri((quarters - 1) * scans.shape[1], numbers.TARE_DISAGREES)
     estimated = dof_within / (dof_within - 2) * (1 + 2 / dof_within)  # the noise within is estimated too
     return Agreement(statistic, float(chi_square * estimated))
 

@@ -104,7 +104,7 @@ START_COST_WIDE = Number(-2.3, "nat", "of a sheet that is uneven", "derived: one
 START_SEEN = Number(0.0063, "unit^2", "action of the touch that must not hide", "derived: half a newton, 10 mm radius")
 START_SEEN_SHARE = Number(0.2, "-", "of the places and sizes where it may", "chosen: four of five are seen")
 START_PAST = Number(10.0, "nat", "of a touch's evidence lost, beyond which none is sought", "derived: less than e^-10")
-START_TOUCHES = Number(3.0, "-", "touches at a start at most", "chosen: as networks were trained")
+START_TOUCHES = Number(3.0, "-", "touches at a start at most", "measured: with 4 world all is touched at its start")
 START_NATS = Number(30.0, "nat", "by which a touch explains the first scans better", "measured: tests of the start")
 START_SURE = Number(16.0, "-", "times the least difference beside which a touch is sure", "measured: as START_NATS")
 """What a skin may be before its first baseline."""
