@@ -22,8 +22,7 @@ from services.describe import BaselineNews, FrameRate, describe, force, symmetry
 from services.estimation.estimator import LAYOUT, Estimator
 from services.estimation.faults.advice import sentences, unchecked
 from services.estimation.images import Operators, Reconstructed, Reconstruction, sigma_of_mean
-from services.estimation.initialisation.baseline import TAKING, Baseline, NoBaseline, plausible_noise
-from services.estimation.initialisation.references import References
+from services.estimation.initialisation.baseline import TAKING, Baseline, NoBaseline, References, plausible_noise
 from services.estimation.tared import KnownBaseline
 from services.estimation.values.estimate import Estimate, Judgement, TouchEstimate
 from services.estimation.values.scan import Scan

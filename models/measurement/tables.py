@@ -20,6 +20,7 @@ from models.measurement.response import DiscGrid, DiscResponse, MeasuredMap, Tou
 from models.measurement.touch import area_of
 from models.patterns import incidence
 
+OF_DROPS = ("jacobian", "along", "turned")  # tables of SkinTables
 MOST_DEGREE = 3
 FIELD_MODES = [(d - j, j) for d in range(MOST_DEGREE + 1) for j in range(d + 1)]
 FIELD_DEGREES = tuple(i + j for i, j in FIELD_MODES)  # of each mode
@@ -88,16 +89,14 @@ class SkinTables:
         gain = float(np.median(z0 / self.z0))
         row = gain * self.z0 / z0
         unlike = float(np.sqrt(np.mean(np.log(row) ** 2)))
+        drops = {name: (getattr(self, name) * row).astype(np.float32) for name in OF_DROPS}
         contact = self.contact * row[:, None]
-        jacobian = (self.jacobian * row).astype(np.float32)
         return replace(
             self,
-            jacobian=jacobian,
-            along=(self.along * row).astype(np.float32),
-            turned=(self.turned * row).astype(np.float32),
+            **drops,
             contact=contact,
             series=self.series * row[:, None],
-            field=_field(jacobian, contact),
+            field=_field(drops["jacobian"], contact),
             misfit=_of_trace_one(self.misfit * np.outer(row, row)),
             z0=z0,
             wrong=float(np.hypot(self.wrong, unlike)),
@@ -106,14 +105,12 @@ class SkinTables:
     def through(self, slopes: Array) -> SkinTables:
         """The same seen through a fault of the wires; slopes (K, K): of log |Z| with it to log |Z| without."""
         single = slopes.T.astype(np.float32)
+        drops = {name: getattr(self, name) @ single for name in OF_DROPS}
+        rest = {name: slopes @ getattr(self, name) for name in ("contact", "series", "field")}
         return replace(
             self,
-            jacobian=self.jacobian @ single,
-            along=self.along @ single,
-            turned=self.turned @ single,
-            contact=slopes @ self.contact,
-            series=slopes @ self.series,
-            field=slopes @ self.field,
+            **drops,
+            **rest,
             misfit=_of_trace_one(slopes @ self.misfit @ slopes.T),
             map=None if self.map is None else self.map.through(slopes),
         )

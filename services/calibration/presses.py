@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from protocol.errors import EitskinError
-from services.estimation.initialisation.references import noise_of_references
+from services.estimation.initialisation.baseline import noise_of_references
 from services.recordings.npz_file import delta_unit
 from services.rows.columns import read_columns
 from services.rows.order import InputError

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.files import FileError
-from services.estimation.initialisation.references import alike
+from services.estimation.initialisation.baseline import alike
 from services.rows.columns import AS_DOCUMENTED, ReadingOptions, read_columns
 from services.rows.files import read_arrays
 from services.rows.order import ORDERS, InputError

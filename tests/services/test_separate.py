@@ -7,7 +7,7 @@ from models.bundle import Bundle
 from protocol.frames import RawFrame
 from services.calibration.presses import part
 from services.calibration.register_command import register_presses
-from services.estimation.initialisation.references import alike, noise_of_references
+from services.estimation.initialisation.baseline import alike, noise_of_references
 from services.pipeline import Pipeline
 from services.recordings import file_source
 from services.recordings.file_source import FileSource, RecordingSource, file_frame

@@ -1,3 +1,1 @@
-"""The first baseline of a skin: whether its scans agree, and whether nothing touches while they do; and a file's
-reference scans.
-"""
+"""The first baseline of a skin: whether its scans agree, and whether nothing touches while they do."""
