@@ -53,7 +53,6 @@ class Baseline:
     doubt: str = ""  # why the skin may have been touched meanwhile; empty: no doubt
     taken_by: str = "start"  # or "command", "file"
     restored: bool = False  # an earlier process took it
-    noise_frames: int = 0  # how many frames sigma was found from; 0: those of the mean
 
     def __post_init__(self) -> None:
         """Whoever holds a baseline holds what its hash says: the arrays are its own, and nobody writes to them."""
@@ -76,7 +75,6 @@ class Baseline:
             z0, sigma = np.array(saved["z0"], dtype=float), np.array(saved["sigma"], dtype=float)
             rest = int(saved["frames"]), str(saved["board"]), int(saved["taken_ns"]), str(saved["doubt"])
             provenance = str(saved.get("taken_by", "start")), bool(saved.get("restored", False))
-            noise_frames = int(saved.get("noise_frames", 0))
         except (KeyError, TypeError, ValueError) as wrong:
             raise NoBaseline(f"no baseline in the saved state ({wrong}): tare again") from None
         if z0.shape != (measurements,) or sigma.shape != (measurements,):
@@ -86,7 +84,7 @@ class Baseline:
         known = int(((z0 > 0) & np.isfinite(sigma)).sum())
         if known < 0.5 * measurements:
             raise NoBaseline(f"the saved baseline knows only {known} of {measurements} measurements: tare again")
-        return cls(z0, sigma, *rest, *provenance, noise_frames)
+        return cls(z0, sigma, *rest, *provenance)
 
 
 def take(frames: Array, pre: PreReconstructor, board: str) -> Baseline:
@@ -256,7 +254,6 @@ class References:
         self._row: list[Array] = []  # those that came one after the other, without another scan in between
         self.noise: Array | None = None  # (K,) relative, of one scan
         self.typical = np.zeros(self._k)  # (K,) |Z| of the scans that it was found from; 0 where nothing was measured
-        self._found_from = 0  # how many those were
         self.scan = -1  # number of the last one
 
     def interrupted(self) -> None:
@@ -276,13 +273,12 @@ class References:
         del self._row[:-MOST_ROWS]
         if self.noise is None or len(self._row) > 1:
             rows = np.array(self._row)
-            self.noise, self._found_from = noise_of_references(rows), len(rows)
+            self.noise = noise_of_references(rows)
             self.typical = np.nan_to_num(_quietly(lambda scans: np.nanmedian(scans, axis=0), rows))
         z0, sigma = np.where(good, amplitude, 0.0), np.where(good, self.noise * amplitude, np.inf)
-        # Two scans share each of the differences that it was found from.
         off = unlike(z0, sigma, pre)
         doubt = f"the reference is {off}: {SEE}" if off else self.doubt
-        return Baseline(z0, sigma, 1, board, sample_ns, doubt, taken_by="file", noise_frames=self._found_from // 2)
+        return Baseline(z0, sigma, 1, board, sample_ns, doubt, taken_by="file")
 
     def sigma(self, baseline: Baseline, pre: PreReconstructor) -> Array:
         """(K,) noise of d against this baseline: that of a typical scan, so that operators are made once for all."""
@@ -291,8 +287,7 @@ class References:
         return np.where(np.isfinite(baseline.sigma) & known, self.noise * share, np.inf)
 
     def state(self) -> dict[str, Any]:
-        state = {"row": np.array(self._row), "noise": self.noise, "typical": self.typical}
-        return state | {"found_from": self._found_from, "scan": self.scan}
+        return {"row": np.array(self._row), "noise": self.noise, "typical": self.typical, "scan": self.scan}
 
     def load(self, state: dict[str, Any]) -> None:
         """Raises KeyError, TypeError or ValueError where it does not fit."""
@@ -300,7 +295,7 @@ class References:
         self._row = [shaped(row, (self._k,), finite=False) for row in state["row"]]
         self.noise = None if state["noise"] is None else shaped(state["noise"], (self._k,))
         self.typical = shaped(state["typical"], (self._k,))
-        self._found_from, self.scan = int(state["found_from"]), int(state["scan"])
+        self.scan = int(state["scan"])
 
 
 def forms(scans: Array) -> Array:

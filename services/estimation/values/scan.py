@@ -32,9 +32,7 @@ class Scan:
     sample_ns: int  # for when what is said of this scan stands: the frame's stamp `sample`
     duration_s: float  # in which all K values were measured
     board: str
-    source: str
     separate: bool  # stands by itself: it does not follow the scan before it in time
-    reference: bool  # known to be untouched
     believed: bool  # acquisition's word
     reasons: tuple[str, ...]  # as they came
 
@@ -72,9 +70,7 @@ class Scan:
             sample_ns=sample_ns,
             duration_s=duration_s,
             board=frame.board,
-            source=frame.source,
             separate="separate" in frame.reasons,
-            reference=frame.kind == "reference",
             believed=valid,
             reasons=tuple(reasons),
         )
