@@ -115,12 +115,7 @@ class TouchCourse:
     def at(self, profiles: Array, time_s: float) -> Array:
         """(n,) of profiles (n, K) at an instant, straight between the values that were measured about it."""
         order = np.argsort(self._times_s)
-        times_s = self._times_s[order]
-        after = min(int(np.searchsorted(times_s, time_s)), len(times_s) - 1)
-        before = max(after - 1, 0)
-        apart_s = times_s[after] - times_s[before]
-        share = min(max((time_s - times_s[before]) / apart_s, 0.0), 1.0) if apart_s > 0 else 0.0
-        return np.asarray((1 - share) * profiles[:, order[before]] + share * profiles[:, order[after]])
+        return np.array([np.interp(time_s, self._times_s[order], profile[order]) for profile in profiles])
 
     def jitter(self, states: Array, priors: Sequence[TouchPrior]) -> Array:
         """(K,) standard deviation of each value by how a touch changes within the steps of its course."""
