@@ -30,7 +30,6 @@ from models.measurement.whitening import Whitening
 Array = NDArray[np.float64]
 Order = NDArray[np.intp]
 
-TINY = np.finfo(float).tiny
 BURST_BLOCK = int(n.BURST_BLOCK)
 ROUNDS = 10  # of learning from the frames of a tare
 FIRST_LINES = (16, 32, 64)  # scans heard, at which lines are made for the first times
@@ -184,7 +183,7 @@ class NoiseModel:
     def __init__(self, tables: SkinTables) -> None:
         self._contact = tables.contact
         self._squares = tables.contact**2
-        self._weight = np.maximum((self._squares**2).sum(axis=0), TINY)
+        self._weight = np.maximum((self._squares**2).sum(axis=0), n.TINY)
         e = tables.electrodes
         self.now = NoiseState(float(n.WHITE**2), np.full(e, n.FLICKER_FLOOR**2), np.zeros(e))
         self.lines = Lines(tables.measurements)
@@ -252,7 +251,7 @@ class NoiseModel:
         n its information.
         """
         columns = white(self._contact)
-        information = np.maximum((columns**2).sum(axis=0), TINY)
+        information = np.maximum((columns**2).sum(axis=0), n.TINY)
         moved = (weighted_residual @ self._contact / information) ** 2
         flicker = (
             np.minimum(moved, n.OUTLIER / information + n.OUTLIER * self.now.flicker).mean(axis=0) - 1 / information
