@@ -20,12 +20,12 @@ from services.estimation.scan_step import EstimatorState, ScanStep
 from services.estimation.tared import KnownBaseline, TaredSkin, TaredState
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, Judgement, judge
-from services.estimation.values.scan import NS, PER_S, Scan
+from services.estimation.values.scan import NANOSECOND, PER_S, Scan
 from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 24  # of a kept state
+LAYOUT = 25  # of a kept state
 
 
 @dataclass
@@ -139,7 +139,7 @@ class Estimator:
         """What touches, by this scan and those before it."""
         self.learn()
         before, self.now.before = self.now.before, scan
-        gap_s = 0.0 if before is None else (scan.at_ns - before.at_ns) * NS
+        gap_s = 0.0 if before is None else (scan.at_ns - before.at_ns) * NANOSECOND
         measured = self._prepared(scan)
         judgements = [judge("believed", float(not scan.believed), 1.0)]
         judgements += self.taring.judgements(self.skin is not None)

@@ -19,7 +19,6 @@ from services.estimation.hypotheses.innovation import (
     BURST,
     DRIFT,
     MEMORY,
-    NANOSECOND,
     NOISE,
     Innovation,
     Observation,
@@ -34,7 +33,7 @@ from services.estimation.track import coasted
 from services.estimation.track_update import update_tracks
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, Judgement, TouchEstimate, Verdict, judge
-from services.estimation.values.scan import Scan
+from services.estimation.values.scan import NANOSECOND, Scan
 
 Array = NDArray[np.float64]
 

@@ -14,14 +14,13 @@ from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, PLACE, RATE, VELOCITY, TouchPrior, anywhere
 from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
-from services.estimation.values.scan import Scan
+from services.estimation.values.scan import NANOSECOND, Scan
 
 Array = NDArray[np.float64]
 Priors = Sequence[TouchPrior]
 
 ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
-NANOSECOND = 1e-9  # [s]
 JUST_BEFORE_S = 1e-5  # a value: the next scans, by whose clock its time is rounded, must not leave it out
 LOG_PRIORS = {
     AS_IT_IS: 0.0,

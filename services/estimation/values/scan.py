@@ -13,7 +13,7 @@ from protocol.frames import RawFrame, as_sent
 
 Array = NDArray[np.float64]
 
-NS, US, PER_S = 1e-9, 1e-6, 1e6  # of clocks [s, s, 1/s]
+NANOSECOND, US, PER_S = 1e-9, 1e-6, 1e6  # of clocks [s, s, 1/s]
 SHORTEST_S, LONGEST_S = 0.005, 2.0  # of a scan that any board measures
 
 
