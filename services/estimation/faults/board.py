@@ -424,10 +424,11 @@ class BoardFaults:
             return
         before = now.size if change.electrode == now.contact else 0.0
         if now.contact not in (-1, change.electrode):
+            walk = n.CONTACT_BACK + n.CONTACT_WALK_CHANGED * abs(now.size)
             self._update_size(view, found)
-            if self._at_home:
+            if well := abs(now.size - self._home) < walk:
                 now.size = self._home
-            if self._at_home or not (now.doubt.undecided or self.began_within(view)):  # else no scan confirmed it
+            if well or not (now.doubt.undecided or self.began_within(view)):  # else no scan confirmed it
                 self._settle()
         if now.contact != change.electrode:
             now.doubt = ContactState()
@@ -466,14 +467,15 @@ class BoardFaults:
             return
         self._update_size(view, answer)
         sd = float(np.sqrt(now.variance))
-        if whole and abs(now.size) < self._unsure and now.doubt.falls(now.size):  # a touch took it over, or it is well
+        unsure = n.CONTACT_BACK + 3 * sd
+        if whole and abs(now.size) < unsure and now.doubt.falls(now.size):  # a touch took it over, or it is well
             self.drop_contact()
             return
         home = self._home
         if whole:
             now.doubt.follow(view.at.middle_s, now.size, sd, home)
         self._time_still(passed_s)
-        now.back_scans = (now.back_scans + whole) if self._at_home else 0
+        now.back_scans = (now.back_scans + whole) if abs(now.size - home) < unsure else 0
         now.variance += (n.CONTACT_WALK_CHANGED * self._impedance) ** 2 * min(passed_s / SCAN_S, 1.0)
         drifts = view.at.middle_s < now.doubt.drifts_until_s
         settles_s = n.UNDECIDED_SETTLES_S if now.doubt.undecided else n.CONTACT_SETTLES_S
@@ -518,18 +520,9 @@ class BoardFaults:
             now.variance *= max(1 - answer.information(column), 1e-4)
 
     @property
-    def _unsure(self) -> float:
-        """By how much its size may be off."""
-        return float(n.CONTACT_BACK + 3 * np.sqrt(self.now.variance))
-
-    @property
     def _home(self) -> float:
         """The size nearest to its own with which it is well: as the skin has it, or as it was at the tare."""
         return min(0.0, -float(self.now.settled[self.now.contact]), key=lambda size: abs(self.now.size - size))
-
-    @property
-    def _at_home(self) -> bool:
-        return abs(self.now.size - self._home) < self._unsure
 
     @property
     def _impedance(self) -> float:
