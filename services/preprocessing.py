@@ -231,7 +231,7 @@ class Preprocessing(Stage):
             self._problem = f"scan {frame.scan} is to be the baseline, but half of its measurements give no value"
             return self._unusable(out, "stale_baseline")
         self.set_baseline(found)
-        self.estimator.saw_untouched()
+        self.estimator.note_untouched()
         out.difference = np.zeros(len(amplitude), np.float32)
         out.sigma = self._reconstruction.sigma.astype(np.float32)
         return out

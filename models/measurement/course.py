@@ -15,7 +15,6 @@ from models.measurement.touch import ACTION, LOG_RADIUS, RATE, SHAPES, STATES, V
 Array = NDArray[np.float64]
 
 
-
 def _steps(parts: int) -> Array:
     """[s] from so many parts of a scan before an instant to as many after it."""
     most = round(parts * n.COURSE_S / n.SUDDEN_S)

@@ -32,7 +32,7 @@ Order = NDArray[np.intp]
 
 BURST_BLOCK = int(n.BURST_BLOCK)
 ROUNDS = 10  # of learning from the frames of a tare
-FIRST_LINES = (16, 32, 64)  # scans heard, at which lines are made for the first times
+FIRST_LINES = (16, 32, 64)  # scans after which lines are made for the first times
 FOLLOWS = 1.5  # scans: one that comes no later than that after another follows it
 
 
@@ -46,7 +46,7 @@ class LineState:
     follows: Annotated[Array, "K", "K"]  # mean product of a scan's residuals with those of the scan before
     columns: Annotated[Array, "K", "n"]
     turn: Annotated[Array, "n", "n"]  # correlation of the columns' amplitudes with those of the scan before
-    heard: int = 0  # scans
+    scans: int = 0  # that it has learnt from
     followed: int = 0  # of them, that came right after another
     elsewhere: int = 0  # scans that ended with other parts, since
     due: bool = False  # the columns are to be made anew
@@ -63,13 +63,13 @@ class LineState:
 
     def take(self, left: Array, odd: bool, at_s: float, span_s: float) -> bool:
         """A residual (K,). Two of scans that were explained alike make a step: whether this one did."""
-        _blend(self.scatter, max(1 / (self.heard + 1), float(n.LEARNING_LINES)), left, left)
-        self.heard += 1
-        self.due = self.due or odd or self.heard in FIRST_LINES or self.heard % n.LINE_SCANS == 0
+        _blend(self.scatter, max(1 / (self.scans + 1), float(n.LEARNING_LINES)), left, left)
+        self.scans += 1
+        self.due = self.due or odd or self.scans in FIRST_LINES or self.scans % n.LINE_SCANS == 0
         before, before_s = (self.before_odd, self.before_odd_s) if odd else (self.before, self.before_s)
         if before is not None:
             step = left - before
-            share = min(1.0, max(2 / self.heard, 2 * float(n.LEARNING_LINES)))
+            share = min(1.0, max(2 / self.scans, 2 * float(n.LEARNING_LINES)))
             _blend(self.alternates, share, step / 2, step)
             if 0 < at_s - before_s < FOLLOWS * span_s:
                 self.followed += 1
@@ -86,7 +86,7 @@ class LineState:
         self.due, self.before, self.before_odd = False, None, None  # with other columns residuals are others
         k = len(self.scatter)
         values, vectors = np.linalg.eigh(self.scatter)
-        chance = white * n.LINE * (1 + np.sqrt(k / min(self.heard, 1 / n.LEARNING_LINES))) ** 2
+        chance = white * n.LINE * (1 + np.sqrt(k / min(self.scans, 1 / n.LEARNING_LINES))) ** 2
         strong = values > chance
         strong[: -int(n.LINES)] = False
         columns, beyond = vectors[:, strong], values[strong] - white
@@ -142,13 +142,13 @@ class Lines:
         beyond = u * np.sqrt(np.maximum(1 - s**2, 0.0))  # what the older one does not tell of the newer
         return np.column_stack([np.where(newer, 0.0, columns) + after @ self.now.turn, after @ beyond])
 
-    def hear(self, left: Array, part: int, odd: bool, at_s: float, span_s: float) -> bool:
+    def update(self, left: Array, part: int, odd: bool, at_s: float, span_s: float) -> bool:
         """Take note of the residual (K,) of an untouched scan. odd: it was disturbed by more than was known. Returns
         whether the columns are to be made anew.
         """
         if part != self.now.part:
             self.now.elsewhere += 1
-            if self.now.heard and self.now.elsewhere < n.ELSEWHERE:
+            if self.now.scans and self.now.elsewhere < n.ELSEWHERE:
                 return False
             self.now = self._begun(part)
         self.now.elsewhere = 0
@@ -160,11 +160,11 @@ class Lines:
         made.columns, made.turn, made.orders = columns, np.zeros((columns.shape[1],) * 2), self.now.orders
         return made
 
-    def hear_anew(self, rows: Array, part: int, white: float) -> None:
+    def restart(self, rows: Array, part: int, white: float) -> None:
         """The same of untouched scans (n, K) that follow each other: what was known before is forgotten."""
-        self.now.heard = self.now.followed = 0  # the first that is heard replaces all
+        self.now.scans = self.now.followed = 0  # the first that is heard replaces all
         for at, row in enumerate(rows):
-            self.hear(row, part, False, float(at), 1.0)
+            self.update(row, part, False, float(at), 1.0)
         self.now.make(white)
 
 
@@ -203,7 +203,7 @@ class NoiseModel:
             energy = float(np.median(weighted_residual**2 / white.conditional_precisions())) / n.MEDIAN_OF_SQUARES
             self.now.white *= min(max(energy, 0.5), 2.0)
             if round_ >= ROUNDS // 2:
-                self.lines.hear_anew(self._left(weighted_residual[alike], part), part, self.now.white)
+                self.lines.restart(self._left(weighted_residual[alike], part), part, self.now.white)
 
     def variances(self) -> Array:
         """(K,) of what is independent from measurement to measurement."""
@@ -234,11 +234,11 @@ class NoiseModel:
         """Follow the contacts' noise alone, as far as a touch that is there leaves it to be seen."""
         self._follow_contacts(weighted_residual[None], white, n.LEARNING)
 
-    def hear(self, weighted_residual: Array, part: int, odd: bool, at_s: float, span_s: float) -> None:
+    def update(self, weighted_residual: Array, part: int, odd: bool, at_s: float, span_s: float) -> None:
         """Take note of what several measurements of a frame have in common beside drift and contacts: weighted_residual
         (K,) is S^-1 of its residual. odd: more than was known.
         """
-        if self.lines.hear(self._left(weighted_residual, part), part, odd, at_s, span_s):
+        if self.lines.update(self._left(weighted_residual, part), part, odd, at_s, span_s):
             self.lines.now.make(self.now.white)
 
     def _left(self, weighted_residual: Array, part: int) -> Array:

@@ -25,7 +25,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 25  # of a kept state
+LAYOUT = 26  # of a kept state
 
 
 @dataclass
@@ -70,7 +70,7 @@ class Estimator:
         if self.skin is not None:
             self.skin = self.skin.with_tables(tables)
 
-    def saw_untouched(self) -> None:
+    def note_untouched(self) -> None:
         """The scan before the next one was untouched, as its source says: what touches then has begun."""
         if self.skin is not None:
             self.skin.touches.now.watched = True
@@ -120,7 +120,7 @@ class Estimator:
         if state.get("layout") != LAYOUT:
             raise ValueError(f"a state of layout {state.get('layout')!r}, expected {LAYOUT}")
         sizes = {"K": self._tables.measurements, "E": self._tables.electrodes}
-        sizes |= {"states": STATES, "shapes": SHAPES, "said": 4}
+        sizes |= {"states": STATES, "shapes": SHAPES, "published": 4}
         known = loaded(WholeState, {name: value for name, value in state.items() if name != "layout"}, sizes)
         skin = None
         if known.tared is not None:

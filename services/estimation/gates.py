@@ -119,8 +119,8 @@ def _lately(at_s: float, measured: Observation) -> bool:
 class SlowState:
     """All that changes."""
 
-    kept: list[FilterState] = field(default_factory=list)  # oldest first
-    looked_s: float = 0.0  # when it was asked last
+    history: list[FilterState] = field(default_factory=list)  # oldest first
+    tested_s: float = 0.0  # when it was asked last
 
 
 class SlowOnsetTest:
@@ -136,19 +136,19 @@ class SlowOnsetTest:
 
     def keep(self) -> None:
         """The filter has learnt from an untouched scan."""
-        kept, filtered = self.now.kept, self._drift.now
-        if kept and 0 <= filtered.at_s - kept[-1].at_s < n.SLOW_S / 2:
+        history, filtered = self.now.history, self._drift.now
+        if history and 0 <= filtered.at_s - history[-1].at_s < n.SLOW_S / 2:
             return
-        kept.append(deepcopy(filtered))
-        while len(kept) > 1 and filtered.at_s - kept[1].at_s >= n.SLOW_S:
-            del kept[0]
+        history.append(deepcopy(filtered))
+        while len(history) > 1 and filtered.at_s - history[1].at_s >= n.SLOW_S:
+            del history[0]
 
     def due(self, at_s: float) -> SkinFilter | None:
         """The filter as it was, when it is time to look."""
         now = self.now
-        if not now.kept or at_s - now.kept[0].at_s < n.SLOW_S or 0 <= at_s - now.looked_s < n.SLOW_EVERY_S:
+        if not now.history or at_s - now.history[0].at_s < n.SLOW_S or 0 <= at_s - now.tested_s < n.SLOW_EVERY_S:
             return None
-        now.looked_s = at_s
+        now.tested_s = at_s
         then = copy(self._drift)
-        then.now = now.kept[0]
+        then.now = now.history[0]
         return then

@@ -34,7 +34,7 @@ def sigma_of_mean(sigma: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     return np.asarray(sigma / np.sqrt(n), np.float32)
 
 
-def kept(made: dict[Key, Made], key: Key, make: Callable[[], Made]) -> Made:
+def cached(made: dict[Key, Made], key: Key, make: Callable[[], Made]) -> Made:
     """What was made for a key, of which the newest KEPT are held; made where it is not there."""
     if key not in made:
         if len(made) >= KEPT:
@@ -56,7 +56,7 @@ class Operators:
         count, against the mean of `tare_frames`. None where too few count.
         """
         key = sigma.tobytes(), averaged, tare_frames
-        return kept(self._made, key, lambda: self._make(sigma.astype(float), averaged, tare_frames))
+        return cached(self._made, key, lambda: self._make(sigma.astype(float), averaged, tare_frames))
 
     def prepare(self, sigma: NDArray[np.float32], averaged: int, tare_frames: int) -> bool:
         """Make that one; False: it is there, or there is none."""
@@ -237,7 +237,7 @@ class Residual:
         return False
 
     def _conditioned(self, sigma: NDArray[np.float32]) -> Conditioned | None:
-        return kept(self._known, sigma.tobytes(), lambda: self._condition(sigma))
+        return cached(self._known, sigma.tobytes(), lambda: self._condition(sigma))
 
     def _condition(self, sigma: NDArray[np.float32]) -> Conditioned | None:
         """None where too few measurements count."""

@@ -323,7 +323,7 @@ class ScanStep:
             skin.null_gate.forget()
         odd = cause in (BURST, NOISE)
         if self._complete:
-            skin.noise.hear(weighted_residual, scan.part, odd, measured.middle_s, measured.span_s)
+            skin.noise.update(weighted_residual, scan.part, odd, measured.middle_s, measured.span_s)
         if not measured.whole:
             return
         self.now.wholes += 1
@@ -384,7 +384,7 @@ class ScanStep:
         """y, sigma (K,): log |Z| over what was predicted, and its standard deviation."""
         measured, touches, judgements = self.measured, self.now.published, self.judgements
         if measured.whole:
-            self.taring.saw(bool(touches) or z2 >= n.FALSE_ALARM_Z2)
+            self.taring.observe(bool(touches) or z2 >= n.FALSE_ALARM_Z2)
         judgements.append(judge("touch", max([z2, *(touch.z2 for touch in touches)]), n.FALSE_ALARM_Z2))
         alone = measured.scan.separate and not touches  # no further row tells whether anything touches
         judgements.append(judge("changing", changing, 1.0, turned=Verdict.REFUSE if alone else None))

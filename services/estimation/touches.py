@@ -217,7 +217,7 @@ class TouchTracks:
     def tell(self, fit: FoundTouches, measured: Observation) -> None:
         """What was taken for a changed contact impedance, until this whole scan, is this touch."""
         track = self._new(fit, 0, measured)
-        track.told_from_contact = track.confirmed = True
+        track.contact_excluded = track.confirmed = True
         track.update(fit, 0, measured)
         self.now.tracks.append(track)
 

@@ -68,7 +68,7 @@ class TrackedTouch:
     moves: bool = False
     z2: float = 0.0  # how much it explains: squared sigmas of its action, in the middle of the scan or at its end
     confirmed: bool = False
-    told_from_contact: bool = False  # several scans told it from a changed contact impedance
+    contact_excluded: bool = False  # several scans told it from a changed contact impedance
     lost: bool = False  # scans were lost since: it may be anywhere
     peak: float = 0.0  # action that it surely had
     surely: float = 0.0  # action that it has, at least, by the last fit

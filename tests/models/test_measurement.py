@@ -282,7 +282,7 @@ def test_a_line_of_any_phase_and_pickup_is_learnt_as_what_scans_have_in_common()
     at_once, one_by_one = NoiseModel(tables()), NoiseModel(tables())
     at_once.begin(frames(128), (0,) * 128)
     for n, left in enumerate(frames(128)):
-        one_by_one.hear(np.linalg.solve(one_by_one.covariance(0), left), 0, False, n * SPAN_S, SPAN_S)
+        one_by_one.update(np.linalg.solve(one_by_one.covariance(0), left), 0, False, n * SPAN_S, SPAN_S)
     for noise, most in ((at_once, 1.3), (one_by_one, 1.6)):
         assert noise.lines.columns(0).shape[1] == 2 and noise.lines.columns(3).shape[1] == 0
         assert 0.8 < energy(noise, frames(64), 0) < most
@@ -300,9 +300,9 @@ def test_what_stays_from_scan_to_scan_is_no_line_and_what_is_learnt_elsewhere_ta
             (slow, 1e-3 * now, 0),
             (ends, 3e-4 * rng.standard_normal(), 0 if n < 40 else 7),
         ):
-            if lines.hear(white + strength * pickup, part, False, n * SPAN_S, SPAN_S):
+            if lines.update(white + strength * pickup, part, False, n * SPAN_S, SPAN_S):
                 lines.now.make(NOISE**2)
-        both.hear(white, 7 if n % 10 else 0, False, n * SPAN_S, SPAN_S)
+        both.update(white, 7 if n % 10 else 0, False, n * SPAN_S, SPAN_S)
         assert both.now.part == 0 and ends.now.part == (0 if n < 40 + ELSEWHERE - 1 else 7), n
     assert np.linalg.norm(stays.columns(0)) < 0.4 * np.linalg.norm(3e-4 * pickup)
     most = np.sqrt(4 * 0.05) * 1e-3 * np.linalg.norm(pickup)  # four times what alternates from scan to scan

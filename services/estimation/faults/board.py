@@ -55,7 +55,7 @@ class FaultState:
     log_gain: float = 0.0  # since the tare
     log_gain_before: float = 0.0  # of what was measured before
     gain_since_s: float = -np.inf
-    gain_said_s: float = -np.inf  # end of the scan in which it was found
+    gain_found_s: float = -np.inf  # end of the scan in which it was found
     gain_steps: int = 0
     log_gain_held: float = 0.0  # with which a scan was last explained that did not change it itself
     log_gain_sound: float = 0.0  # before a gross step
@@ -154,7 +154,7 @@ class BoardFaults:
         now = self.now
         if not self.sound or self.gain_gross(oldest_s):
             return False
-        return oldest_s > max(now.gain_since_s, now.gain_said_s, now.wire_since_s)
+        return oldest_s > max(now.gain_since_s, now.gain_found_s, now.wire_since_s)
 
     def taken_off(self, over: Array) -> Array:
         """(K,) log |Z| over an untouched skin without what the board and contacts have for good. over (K,)."""
@@ -369,7 +369,7 @@ class BoardFaults:
             white = Whitening.of(innovation.covariance + more)
             scan = Unexplained(y, 1 / (1 + touched), innovation.live, innovation.times_s, innovation.span_s, white)
             best = max(self._changes(scan, columns), key=lambda change: change.score + change.log_prior)
-            if (not best.is_gain and abs(best.size) > n.CONTACT_MOST) or scan.since(best.since_s).sum() < n.TOLD_BY:
+            if (not best.is_gain and abs(best.size) > n.CONTACT_MOST) or scan.since(best.since_s).sum() < n.CHANGE_ROWS:
                 continue
             likelier = best.score + best.log_prior > white.log_likelihood(y) and best.chi2 < most_chi2
             if likelier and best.electrode not in [change.electrode for change in found]:
@@ -418,7 +418,7 @@ class BoardFaults:
         if change.is_gain:
             now.log_gain_before, now.gain_since_s = now.log_gain, since_s
             now.log_gain += n.GAIN_CHANGES * sigmas
-            now.gain_said_s = view.at.end_s
+            now.gain_found_s = view.at.end_s
             now.gain_steps += 1
             self._note_gross(max(since_s, view.at.oldest_s))
             return
@@ -492,7 +492,7 @@ class BoardFaults:
 
     def gain_holds(self, end_s: float) -> None:
         """A scan that ends then is explained for sure with the gain as it is."""
-        if self.now.gain_said_s < end_s:
+        if self.now.gain_found_s < end_s:
             self.now.log_gain_held = self.now.log_gain
 
     def _revert_gain(self) -> None:
@@ -556,7 +556,7 @@ class BoardFaults:
 
     def gain_stepped(self, oldest_s: float) -> bool:
         """Whether a scan whose oldest value is of then holds a step of the gain, or shows it first."""
-        return oldest_s < max(self.now.gain_since_s, self.now.gain_said_s)
+        return oldest_s < max(self.now.gain_since_s, self.now.gain_found_s)
 
     def gain_gross(self, at_s: float) -> bool:
         """Whether the gain is as no sound board's, and has not lasted."""

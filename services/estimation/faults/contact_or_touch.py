@@ -65,7 +65,7 @@ class ContactOrTouchTest:
         touch = self._touch(asked)
         odds = contact.score - touch.score
         jumped = odds > n.FAULT_SURE and self._jumped(asked, contact) and _unseen(found.innovation, touch)
-        if odds > n.CONTACT_TOLD or jumped:
+        if odds > n.CONTACT_DECIDED or jumped:
             doubt.end(faults.size)
         elif odds < -n.FAULT_SURE and touch.explained:
             return touch.fit

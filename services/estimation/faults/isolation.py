@@ -107,7 +107,7 @@ class FaultIsolation:
             return found
         doubtful = _doubtful(found.answer)
         for k, track in enumerate(self._touches.now.tracks):
-            due = (track.contact_due or track.weakened) and not track.told_from_contact
+            due = (track.contact_due or track.weakened) and not track.contact_excluded
             if not (due or doubtful) or track.ended or not self._faults.on_electrode(track.state):
                 continue
             other = self._without(found, k)
@@ -148,8 +148,8 @@ class FaultIsolation:
             touches.tell(touch, self._at)
         elif faults.now.contact < 0:
             for track in touches.now.tracks:
-                track.told_from_contact = faults.on_electrode(track.state)
-                track.confirmed = track.confirmed or track.told_from_contact
+                track.contact_excluded = faults.on_electrode(track.state)
+                track.confirmed = track.confirmed or track.contact_excluded
 
     def _standing_change(self, priors: Sequence[TouchPrior], but: int = -1) -> tuple[Array, Array]:
         """(K,) what touches that stand do to each |Z|, and (K, K) the covariance of what they may have changed by: a

@@ -470,10 +470,10 @@ class Hypotheses:
             return []
         priors, association = list(tracked), list(range(len(tracked)))
         if end.at_s > -np.inf:
-            went = priors[end.touch]
+            released = priors[end.touch]
             if end.at_s < np.inf:
-                went = acting_steadily(went, float(went.start[ACTION]), innovation.span_s)
-            priors[end.touch] = replace(went, until_s=end.at_s)
+                released = acting_steadily(released, float(released.start[ACTION]), innovation.span_s)
+            priors[end.touch] = replace(released, until_s=end.at_s)
         else:
             del priors[end.touch], association[end.touch]
         return [self.fitted(innovation, priors, tuple(association)) if priors else self.untouched(innovation)]

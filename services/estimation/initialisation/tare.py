@@ -217,7 +217,7 @@ class Taring:
         if doubt:
             self.now.judgements = (judge("baseline", 1.0, 1.0),)
 
-    def saw(self, touched: bool) -> None:
+    def observe(self, touched: bool) -> None:
         """Whether something touched in the latest whole scan."""
         self.now.touched = touched
         self.now.untouched = 0 if touched else self.now.untouched + 1

@@ -116,7 +116,7 @@ class TouchEstimate:
     vy: float
     log_radius: float  # of the disc of its area
     drop: float  # of conductivity, mean over the disc
-    covariance: Annotated[Array, "said", "said"]  # (4, 4) of x, y, log radius, drop
+    covariance: Annotated[Array, "published", "published"]  # (4, 4) of x, y, log radius, drop
     z2: float  # of the disc: how much it explains, in squared sigmas
     strength: float  # integral of drop / (1 - drop / 2): what the measurements tell best
     strength_sd: float
