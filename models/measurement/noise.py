@@ -162,7 +162,7 @@ class Lines:
 
     def restart(self, rows: Array, part: int, white: float) -> None:
         """The same of untouched scans (n, K) that follow each other: what was known before is forgotten."""
-        self.now.scans = self.now.followed = 0  # the first that is heard replaces all
+        self.now.scans = self.now.followed = 0  # the first of them replaces all
         for at, row in enumerate(rows):
             self.update(row, part, False, float(at), 1.0)
         self.now.make(white)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.fit import FoundTouches
-from models.measurement.numbers import LEARNING
 from models.measurement.tables import FIELD_DEGREES, SkinTables
 from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
@@ -145,12 +144,12 @@ class SkinFilter:
         return covariance
 
     def widen(self, times: float) -> None:
-        """It drifts faster than it did: by what `faster` says, of which a share stays, in value and rate."""
+        """It drifts faster than it did: by what `faster` says, of which a share stays."""
         p, modes = self.now.p, np.arange(MODES)
-        p[modes, modes] += LEARNING * times * self._faster
-        p[modes + MODES, modes + MODES] += LEARNING * self._faster
+        p[modes, modes] += n.FASTER_STAYS * times * self._faster
+        p[modes + MODES, modes + MODES] += n.FASTER_STAYS * self._faster
         contacts = np.r_[self.contacts]
-        p[contacts, contacts] += LEARNING * (times - 1) * n.CONTACT_FASTER**2
+        p[contacts, contacts] += n.FASTER_STAYS * (times - 1) * n.CONTACT_FASTER**2
 
     def update(self, predicted: Prediction, y: Array, white: Whitening) -> Array:
         """Learn from an untouched frame: y (K,) over the prediction, white: of its covariance. Returns S^-1 y (K,)."""

@@ -172,8 +172,7 @@ class TrackedTouch:
         own, span_s, whole = slice(STATES * k, STATES * (k + 1)), measured.span_s, measured.whole
         state, covariance = fit.states[k], fit.covariance[own, own]
         self.jumped = not (self.lost or self.ended) and distance(self.state, state) > max(n.SAME_TOUCH, self.radius)
-        steps = whole and self._steps_to(state, covariance, measured.middle_s)
-        self.since_step = 0 if steps else self.since_step + whole
+        last, last_s = self.state, self.at_s
         self.state, self.covariance, self.at_s, self.lost = state, covariance, measured.middle_s, False
         self.z2 = max((max(action, 0.0) / sd) ** 2 for action, sd in map(self._action, (0.0, span_s / 2)))
         if self.ended:
@@ -186,20 +185,20 @@ class TrackedTouch:
         elif whole:
             self.still += 1
         self.scans += whole
+        self.since_step = 0 if self._stepped(last, last_s) else self.since_step + whole
         if whole:
             self._follow_place()
         before, self.surely = self.surely, float(state[ACTION] - 2 * sd[ACTION])
         # The few new values of one part may be explained by any touch, also where none is the reason.
         self.peak = max(self.peak, self.surely if whole else min(before, self.surely))
 
-    def _steps_to(self, state: Array, covariance: Array, at_s: float) -> bool:
-        """Whether a state is not what it came to by its motion: something may have ended there, or begun."""
-        passed_s = at_s - self.at_s
-        way = state[PLACE] - self.state[PLACE] - self.state[VELOCITY] * passed_s
-        change = state[ACTION] - self.state[ACTION] - self.state[RATE] * passed_s
-        sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        far = np.hypot(*way) > max(n.STILL_WAY, 3 * float(np.hypot(*sd[PLACE])))
-        return bool(far or abs(change) > max(n.STILL_CHANGE * abs(self.state[ACTION]), 3 * sd[ACTION]))
+    def _stepped(self, before: Array, before_s: float) -> bool:
+        """Whether the motion of a state (7,) before does not lead to its own: something may have ended, or begun."""
+        passed_s, sd = self.at_s - before_s, n.SIGMAS * self.sd
+        way = self.state[PLACE] - before[PLACE] - before[VELOCITY] * passed_s
+        change = self.state[ACTION] - before[ACTION] - before[RATE] * passed_s
+        far = np.hypot(*way) > max(n.STILL_WAY, float(np.hypot(*sd[PLACE])))
+        return bool(far or abs(change) > max(n.STILL_CHANGE * abs(before[ACTION]), sd[ACTION]))
 
     def learn(self, fit: FoundTouches, k: int) -> None:
         """Radius and outline, of a scan that shares no value with the one before."""

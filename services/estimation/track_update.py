@@ -92,11 +92,11 @@ def _doubt(skin: TaredSkin, innovation: Innovation, answer: ScoredAnswer, measur
         if other.quiet and other.score > answer.score + least and touches.stay(other.fit, other.association):
             none.append((other.score - least, k))
         elif not track.confirmed and not skin.faults.in_question(track.state):
-            track.confirmed = _acts(track, alone=len(touches) == 1) and not strange
+            track.confirmed = _needed(track, alone=len(touches) == 1) and not strange
     if none:
         touches.remove(max(none)[1])
 
 
-def _acts(track: TrackedTouch, alone: bool) -> bool:
+def _needed(track: TrackedTouch, alone: bool) -> bool:
     """Whether several scans need a touch. alone: something touches, be its strength known or not."""
     return track.scans >= n.SURE_SCANS and (alone or track.z2 > n.ACTS_Z2)

@@ -191,8 +191,24 @@ class BoardFaults:
             opens, lifted, silent = (), (), False  # what fails is left out: a wire that is wrong may be why
         dead = dead | (at_s < now.wire_since_s)  # measured by wires that were otherwise
         live = self._known & ~dead & ~self.member[:, list(opens)].any(axis=1)
-        showing = log_z, sound, failed, live, shown, slopes, mean, spread, now.contact, apart
-        return BoardView(at, predicted, untouched, *showing, opens, lifted, silent)
+        return BoardView(
+            at=at,
+            predicted=predicted,
+            untouched=untouched,
+            opens=opens,
+            lifted=lifted,
+            silent=silent,
+            log_z=log_z,
+            sound=sound,
+            failed=failed,
+            live=live,
+            shown=shown,
+            slopes=slopes,
+            mean=mean,
+            spread=spread,
+            contact=now.contact,
+            apart=apart,
+        )
 
     def take_over(self, view: BoardView) -> None:
         """Which electrodes answer, by the view that explains a scan."""
@@ -467,7 +483,7 @@ class BoardFaults:
             return
         self._update_size(view, answer)
         sd = float(np.sqrt(now.variance))
-        unsure = n.CONTACT_BACK + 3 * sd
+        unsure = n.CONTACT_BACK + n.SIGMAS * sd
         if whole and abs(now.size) < unsure and now.doubt.falls(now.size):  # a touch took it over, or it is well
             self.drop_contact()
             return
@@ -550,7 +566,7 @@ class BoardFaults:
         """(E,) of the wire format."""
         now = self.now
         plain = abs(now.size) > n.CONTACT_PLAIN and not now.doubt.beside
-        named = plain or not now.doubt.undecided or now.doubt.seen >= n.SURE_SCANS
+        named = plain or not now.doubt.undecided or now.doubt.seen >= n.NAMED_SCANS
         contact = now.contact if named else -1
         return advice.states_of(len(now.settled), now.wire, now.opens, contact, now.silent)
 
@@ -560,7 +576,7 @@ class BoardFaults:
 
     def gain_gross(self, at_s: float) -> bool:
         """Whether the gain is as no sound board's, and has not lasted."""
-        return self.now.gross_since_s <= at_s < self.now.gross_since_s + n.LOST_S
+        return self.now.gross_since_s <= at_s < self.now.gross_since_s + n.GAIN_LASTS_S
 
     @property
     def sound(self) -> bool:

@@ -43,47 +43,47 @@ class FaultIsolation:
         faults, before = self._faults, (self._faults.now.wire, self._faults.now.wire_since_s)
         standing = self._touches.expected(self._at)
         view = self._look(faults.now.lifted)
-        if faults.now.wire is None and self._rewired(view, standing):
+        if faults.now.wire is None and self._rewire(view, standing):
             view = self._look(view.lifted)
-        found = self._asked(selection, view)
+        found = self._explain_view(selection, view)
         odd = _doubtful(found.answer) or -1 in found.answer.association
-        if faults.now.wire is not None and odd and self._rewired(view, standing):
-            found = self._asked(selection, self._look(view.lifted))
+        if faults.now.wire is not None and odd and self._rewire(view, standing):
+            found = self._explain_view(selection, self._look(view.lifted))
         if found.view.opens and faults.now.wire is None and (odd or (self._at.whole and self._touches.in_doubt)):
-            found = self._lifted(found, selection)
+            found = self._try_lifted(found, selection)
         faults.take_over(found.view)
         if faults.asks(found.answer):
-            found = self._faulty(found, selection, standing)
+            found = self._try_faults(found, selection, standing)
         if not found.answer.nearly_holds:  # what does not explain its scan would stand beside any touch in the next one
             faults.now.wire, faults.now.wire_since_s = before
-        return self._doubted(found)
+        return self._doubt_touches(found)
 
     def _look(self, lifted: tuple[int, ...]) -> BoardView:
         return self._faults.look(self._at, self._predicted, self._skin.log_z0 + self._predicted.shift, lifted)
 
-    def _rewired(self, view: BoardView, standing: Sequence[TouchPrior]) -> bool:
+    def _rewire(self, view: BoardView, standing: Sequence[TouchPrior]) -> bool:
         if not self._faults.suspects_wires(view):
             return False
         touched, _ = self._standing_change(standing)
         skin, own = self._covariances
         return self._faults.wires_changed(view, touched, skin + self._skin.hypotheses.inflated_drift(), own)
 
-    def _asked(self, selection: HypothesisSelection, view: BoardView) -> Explanation:
+    def _explain_view(self, selection: HypothesisSelection, view: BoardView) -> Explanation:
         hypotheses = self._through_wires(view)
         innovation = selection.innovation(hypotheses, view, view.covariance(*self._covariances))
         answer = selection.recounted(hypotheses, innovation, selection.answer(hypotheses, innovation))
         return Explanation(view, innovation, answer)
 
-    def _lifted(self, found: Explanation, selection: HypothesisSelection) -> Explanation:
+    def _try_lifted(self, found: Explanation, selection: HypothesisSelection) -> Explanation:
         """Electrodes that are open may be off the skin, or on it and cut off: whichever explains the scan better. A
         touch that has just come is not known well enough to decide by little: the scans that follow ask again.
         """
-        other = self._asked(selection, self._look(() if found.view.lifted else found.view.opens))
+        other = self._explain_view(selection, self._look(() if found.view.lifted else found.view.opens))
         sure = n.WIRE_SURE if -1 in found.answer.association else n.FAULT_SURE
         better = (other.answer.holds, other.answer.score) > (found.answer.holds, found.answer.score + sure)
         return other if better else found
 
-    def _faulty(
+    def _try_faults(
         self, found: Explanation, selection: HypothesisSelection, standing: Sequence[TouchPrior]
     ) -> Explanation:
         hypotheses, fit = self._through_wires(found.view), found.answer.fit
@@ -99,7 +99,7 @@ class FaultIsolation:
         nearby = found.view.through(nearby)
         return self._faults.explained_by_fault(found, touched, nearby, ask) or found
 
-    def _doubted(self, found: Explanation) -> Explanation:
+    def _doubt_touches(self, found: Explanation) -> Explanation:
         """Is a touch on an electrode its contact impedance? Asked at some ages, when a weak one changes, and when it
         does not plainly explain a scan: a contact that changes under a touch is left when the touch goes.
         """
@@ -110,13 +110,13 @@ class FaultIsolation:
             due = (track.contact_due or track.weakened) and not track.contact_excluded
             if not (due or doubtful) or track.ended or not self._faults.on_electrode(track.state):
                 continue
-            other = self._without(found, k)
+            other = self._explain_without(found, k)
             if other is not None:
                 self._touches.remove(k)
                 return other
         return found
 
-    def _without(self, found: Explanation, k: int) -> Explanation | None:
+    def _explain_without(self, found: Explanation, k: int) -> Explanation | None:
         """A scan explained by a fault instead of the k-th track."""
         standing, loose = self._touches.expected(self._at), self._touches.expected(self._at, manoeuvring=True)
         del standing[k], loose[k]

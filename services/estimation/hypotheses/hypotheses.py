@@ -92,7 +92,7 @@ class Hypotheses:
         self.grid, self.response, self.detector = tables.grid, tables.response, TouchDetector(tables.grid, tables.wrong)
         self._tables, self._noise, self._drift = tables, noise, drift
         self._slopes: Array | None = None
-        self._seen: tuple[WireFault, Hypotheses] | None = None  # through a fault of the wires
+        self._through_wire: tuple[WireFault, Hypotheses] | None = None  # through a fault of the wires
         # Touches that nothing explains for certain must not be taken for noise.
         self._wider = WIDER if tables.predicted else (MEMORY, DRIFT, BURST)
         self.process_noise_scale = 1.0  # times the faster drift: grows while nothing explains the skin
@@ -101,16 +101,16 @@ class Hypotheses:
     def through(self, wire: WireFault | None, slopes: Array | None) -> Hypotheses:
         """The same of a skin that is seen through a fault of the wires; slopes (K, K): as that begins."""
         if wire is None or slopes is None:
-            self._seen = None
+            self._through_wire = None
             return self
-        if self._seen is not None and self._seen[0] == wire:
-            return self._seen[1]
+        if self._through_wire is not None and self._through_wire[0] == wire:
+            return self._through_wire[1]
         seen = copy(self)
         seen._tables, seen.grid = self._tables.through(slopes), self.grid.through(slopes)
         seen.response = seen._tables.response
         seen.detector = TouchDetector(seen.grid, seen._tables.wrong)
         seen._slopes = slopes
-        self._seen = wire, seen
+        self._through_wire = wire, seen
         return seen
 
     def inflated_drift(self) -> Array:
@@ -448,10 +448,9 @@ class Hypotheses:
     def _turned(self, innovation: Innovation, tracked: Priors, turn: StrengthStep | None) -> list[ScoredAnswer]:
         """Strengths changed at once: that of one in mid-scan, or any at its end, as they go or are pressed harder."""
         priors = list(tracked)
-        before_s = -0.5 * innovation.span_s - innovation.span_s
         for k, prior in enumerate(tracked):
             # Until then it acts as it did, since a scan before this one: else two that begin would look like one.
-            if prior.until_s < np.inf or prior.since_s >= before_s:
+            if prior.until_s < np.inf or prior.since_s >= -1.5 * innovation.span_s:
                 continue
             if turn is None:
                 steady = acting_steadily(prior, float(prior.start[ACTION]), innovation.span_s)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START, SIGMAS, TINY, WHITE, Number
+from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START, LEARNING, SIGMAS, TINY, WHITE, Number
 
 __all__ = ["CONTACT_START", "FALSE_ALARM_Z2", "FIELD_START", "SIGMAS", "TINY", "WHITE"]  # beside this module's own
 
@@ -23,6 +23,7 @@ FIELD_RATE_WALK = Number(2e-5, "1/s/sqrt(s)", "its walk", "measured: half a degr
 SLOPE_RATE_WALK = Number(8e-6, "1/s/sqrt(s)", "the same across the sheet", "derived: 0.4 of FIELD_RATE_WALK")
 FIELD_FASTER = Number(1e-3, "-", "faster drift than that, in one scan", "derived: ten sigmas of one measurement")
 SLOPE_FASTER = Number(5e-4, "-", "the same across the sheet", "derived: half of FIELD_FASTER")
+FASTER_STAYS = LEARNING  # of that variance, in value and rate from then on: 20 such scans
 CONTACT_FASTER = Number(2e-3, "-", "faster change of a contact impedance in one scan", "derived: ten of CONTACT_WALK")
 CONTACT_WALK = Number(2e-4, "1/sqrt(s)", "a contact impedance", "measured: drifts of 0.1 to 1 %/s, 0 to 1 phantom")
 CONTACT_RATE = Number(8e-4, "1/s", "the same while nobody watches", "derived: a quarter in 5 minutes; skin.toml's own")
@@ -134,8 +135,8 @@ SLOW_S = Number(10.0, "s", "after which a slow press is told from drift", "chose
 SLOW_EVERY_S = Number(1.0, "s", "from look to look for one", "chosen: cost, 4 ms")
 SLOW_TIMES = Number(400.0, "-", "times FIELD_FASTER^2: drift meanwhile", "derived: contacts 4 %, 5 times CONTACT_RATE")
 CHANGING_S = Number(0.1, "s", "for which what nothing explains is said to be changing", "derived: two whole scans")
-LOST_S = Number(1.0, "s", "for which a skin or a gain was another, until that is taken over", "derived: half of 2 s")
-LOST_SCANS = Number(8.0, "-", "whole scans from search to search then", "derived: TARE_RETRIES, three a second")
+LOST_S = Number(1.0, "s", "of nothing that explains it, after which no touch is vouched for", "derived: half of 2 s")
+LOST_SCANS = Number(8.0, "-", "whole scans from search to search then", "chosen: cost, three searches a second")
 GAP_S = Number(0.13, "s", "without a scan, after which touches may be anywhere", "derived: three whole scans")
 DOUBT_Z2 = Number(400.0, "-", "z^2 of a touch that every whole scan asks whether it is drift", "derived: 20 sigmas")
 DOUBT_SCANS = Number(10.0, "-", "whole scans after which every touch is asked that", "derived: twice a second")
@@ -179,6 +180,7 @@ BACK_SCANS = Number(3.0, "-", "whole scans for which it must be", "chosen: a loo
 CONTACT_DECIDED = Number(24.0, "nat", "by which a contact is likelier than a touch", "measured: light touches reach 18")
 TOUCH_SECOND = Number(4.0, "1/unit^4", "what a touch does to its electrode, of its action squared", "measured: 4 A^2")
 CONTACT_PLAIN = Number(0.5, "-", "change that is named at once", "measured: touches on electrodes reach 0.35")
+NAMED_SCANS = SURE_SCANS  # whole scans more after which what may be a touch is named
 PACE_S = Number(0.6, "s", "for which a contact that drifts goes on steadily", "chosen: a press takes less to come")
 PACE_LEAST = Number(0.02, "-", "of its impedance, least change in that time", "derived: 3 % a second")
 PACE_BENDS = Number(0.15, "-", "of the way, from a straight line", "chosen: as the service before")
@@ -187,6 +189,7 @@ PACE_GROWS = Number(2.0, "-", "times its pace that a contact may drift", "chosen
 UNDECIDED_SETTLES_S = Number(60.0, "s", "still so long, what may be a touch is the skin's", "chosen: nobody rests so")
 GAIN_Z2 = Number(25.0, "-", "squared sigmas that all values share, from which a gain's step is asked", "derived: 1e-6")
 GAIN_GROSS = Number(0.14, "-", "log of a step that no sound board's gain makes", "data sheet: RTIA and PGA, a tenth")
+GAIN_LASTS_S = LOST_S  # for which such a step must last to be taken over
 GAIN_BACK = Number(0.01, "-", "log of what is left of it when it ends", "derived: drift of a minute")
 CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itself", "derived: a fifth of its walk")
 ON_ELECTRODE = Number(0.2, "unit", "gap below which a touch changes an electrode's contact", "derived: its width")
