@@ -29,6 +29,7 @@ from models.measurement.touch import (
     TouchPrior,
     X,
     Y,
+    is_anywhere,
     is_disc,
     within_limits,
 )
@@ -37,6 +38,7 @@ from models.measurement.whitening import Whitening, diagonal_of, factor
 Array = NDArray[np.float64]
 
 LEAST_MEAN = -0.9  # relative change: nothing takes all of an impedance away
+SIZE_SAME = 1.1  # times the squared change for which evidence holds
 SIZE_CHANGED = 2.5  # times the squared change, or its inverse, beyond which its misfit is taken anew
 MOST_DAMPING = 1e4
 
@@ -48,9 +50,9 @@ class KnownWhitening:
     white: Whitening
     size2: float
 
-    def fits(self, size2: float) -> bool:
-        """Whether the misfit of touches of another squared change is nearly the same."""
-        return 1 / SIZE_CHANGED < size2 / self.size2 < SIZE_CHANGED
+    def fits(self, size2: float, times: float) -> bool:
+        """Whether the misfit of touches of another squared change is the same, but for so many times."""
+        return 1 / times < size2 / self.size2 < times
 
 
 @dataclass(frozen=True)
@@ -163,6 +165,7 @@ class TouchFitter:
         self._mean, self._precision = np.concatenate(means), np.concatenate(sds) ** -2.0
         self._states = STATES * len(self._priors)
         self._shapes = len(self._mean) - self._states
+        self._tells_after = n.TELLS_AFTER if any(is_anywhere(prior) for prior in self._priors) else 0
         self.steps = 0
 
     def fit(self, most_steps: int) -> FoundTouches:
@@ -174,13 +177,14 @@ class TouchFitter:
         self._whiten(states, columns)
         states, columns = self._first_actions(states, columns)
         point = self._descend(self._linearised(states, rest, columns), most_steps)
-        changed, moved = not self._known.fits(_size2(point.columns)), self._moved(point.states)
+        changed, moved = not self._known.fits(_size2(point.columns), SIZE_CHANGED), self._moved(point.states)
         rest = self._turn(point.states, point.rest) if moved else point.rest
         if changed:
             self._whiten(point.states, point.columns)
         if moved or changed:
             point = self._descend(self._linearised(point.states, rest, self._columns(point.states, rest)), most_steps)
-        if _size2(point.columns) < 1 / SIZE_CHANGED * self._known.size2:  # larger touches' misfit explains anything
+        if self._known is not self._scene.known and not self._known.fits(_size2(point.columns), SIZE_SAME):
+            # Another one's misfit would make their evidence another by some nats.
             self._whiten(point.states, point.columns)
             point = self._linearised(point.states, point.rest, point.columns)
         return self._posterior(point)
@@ -222,23 +226,31 @@ class TouchFitter:
             step = normal.step(damping)
             if not np.isfinite(step).all():
                 break  # measurements of any magnitude: nothing explains them
-            if self._is_linear(point.states, normal.step(0.0)):
+            if self._is_linear(point.states, linear := normal.step(0.0)) or self._hopeless(point, normal, linear):
                 break
             self.steps += 1
             tried = self._stepped(point, step)
             gained = point.objective - tried.objective
             if gained > 0:
-                point, damping = tried, max(damping / 10, 1e-5)
+                point, damping = tried, max(damping / 3, 1e-5)
             else:
-                damping = max(damping * 20, 1e-2)
+                damping = max(damping * 10, 1e-2)
             if abs(gained) < max(n.DONE, n.DONE_SHARE * point.objective) or damping > MOST_DAMPING:
                 break
         return point
 
+    def _hopeless(self, point: _Linearisation, normal: _NormalEquations, step: Array) -> bool:
+        """Whether the linear optimum explains nothing either. Of touches that may be anywhere the first steps tell
+        little of where they end.
+        """
+        if self.steps < self._tells_after:
+            return False
+        return point.objective - float(normal.slope @ step) > n.HOPELESS * self._scene.live
+
     def _whiten(self, states: Array, columns: TouchColumns) -> None:
         size2, scene = max(_size2(columns), n.TINY), self._scene
         known = scene.known
-        if known is not None and known.fits(size2):
+        if known is not None and known.fits(size2, SIZE_CHANGED):
             self._known = known
             return
         covariance = scene.covariance + self._misfit**2 * size2 * scene.misfit

@@ -72,8 +72,14 @@ class TouchTracks:
             odd = oddness(track.shape)
             again = odd > n.ODDER * track.asked_odd or track.doubt_due
             if (odd > n.ODD_OUTLINE and again) or track.scans in n.COUNT_DOUBTS:
-                track.asked_odd, due = odd, True
+                track.asked_odd, track.askings, due = odd, track.askings + 1, True
         return due
+
+    @property
+    def recount_gain(self) -> float:
+        """Evidence [nat] of other touches: the more, the oftener it was asked, as each asking errs now and then."""
+        askings = max((track.askings for track in self.lasting), default=0)
+        return n.RECOUNT_GAIN + 2 * float(np.log(max(askings, 1)))
 
     def correct(self, fit: FoundTouches, association: Sequence[int]) -> None:
         """Tracks were taken for several touches, or for parts of one: what they pressed, and where, was never so."""

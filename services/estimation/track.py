@@ -79,6 +79,7 @@ class TrackedTouch:
     held_at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x, y, log radius then
     stayed_since_s: float = 0.0  # at held_at
     asked_odd: float = 0.0  # how odd its outline was when it was asked last whether it is several
+    askings: int = 0  # how often it was asked that
 
     @property
     def doubt_due(self) -> bool:

@@ -53,16 +53,23 @@ def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> No
     separate, whole = measured.scan.separate, measured.whole
     if not (answer.explained or separate) or 2 * answer.over < n.SURE_Z2:
         return
-    least_z2, place_tells = _least_z2(skin, answer, separate), not whole and answer.cause == AS_IT_IS
     may_wait = skin.tables.predicted and not separate
+    least_z2 = _least_z2(skin, answer, separate)
+    place_tells = answer.cause == AS_IT_IS and not any(map(_may_be_two, skin.touches.now.tracks))
     for track in skin.touches.now.tracks:
-        # How strongly it presses a first part hardly tells: its place and that it is there, it does.
-        placed = place_tells and track.place_sd < n.PLACED and track.z2 > n.ACTS_Z2
-        surely = (track.z2 > least_z2 or placed) and not skin.faults.in_question(track.state)
-        # One that is broad may be two that began together, and is where neither of them is.
-        broad = bool(track.state[LOG_RADIUS] > np.log(n.BROAD)) and track.scans < n.SURE_SCANS
-        waits = may_wait and (broad or (track.jumped and not whole))
+        surely = (track.z2 > least_z2 or (place_tells and _placed(track))) and not skin.faults.in_question(track.state)
+        waits = may_wait and (_may_be_two(track) or (track.jumped and not whole))
         track.confirmed = (track.confirmed or surely) and not waits
+
+
+def _may_be_two(track: TrackedTouch) -> bool:
+    """One that has just come and is broad may be two that began together, and is where neither of them is."""
+    return bool(track.state[LOG_RADIUS] > np.log(n.BROAD)) and track.scans < n.SURE_SCANS
+
+
+def _placed(track: TrackedTouch) -> bool:
+    """How strongly it presses the values since it began hardly tell: its place and that it is there, they do."""
+    return track.place_sd < n.PLACED and track.z2 > n.ACTS_Z2
 
 
 def _least_z2(skin: TaredSkin, answer: ScoredAnswer, separate: bool) -> float:

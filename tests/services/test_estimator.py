@@ -66,7 +66,12 @@ def test_a_touch_begins_is_held_and_ends_with_one_id_and_an_image(parts):
     assert shows(between_s(frames, ended[-1] + 0.01), 0)
 
 
-# several touches
+@pytest.mark.parametrize("seen_s", [0.024, 0.03])
+def test_a_press_is_shown_by_the_whole_scan_in_which_it_begins(seen_s):
+    none, full, begin_s = impedance(), impedance(TOUCH), FREE_S + curves.SCAN_S - 0.004 - seen_s
+    frames = run(between((0, none), (begin_s, none), (begin_s + 1e-3, full), (60, full)), FREE_S + 0.2, 1)
+    first = next(frame for frame in frames if curves.lasting(frame))
+    assert at_s(first) < FREE_S + curves.SCAN_S / 2 and far_off(first.contacts[0], TOUCH) < 3e-3
 
 
 @BOTH

@@ -91,6 +91,8 @@ class FaultIsolation:
         touched, nearby = self._standing_change(standing)
 
         def ask(other: Innovation) -> ScoredAnswer:
+            if found.answer.explained and -1 in found.answer.association and not self._at.scan.separate:
+                return hypotheses.of_fewer(other, found.answer)
             again = replace(other, candidates=likely, places=found.answer.association)
             return selection.answer(hypotheses, again)
 

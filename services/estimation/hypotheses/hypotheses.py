@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from itertools import takewhile
+from itertools import combinations, takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,13 +60,28 @@ WIDER = (MEMORY, DRIFT, BURST, NOISE)
 
 @dataclass(frozen=True)
 class StrengthStep:
-    """One of the tracked touches acts otherwise at once. at_s: -inf: before the scan; inf: one that was taken for ended
-    goes on. share: of its action after that; 0: it ended.
+    """Tracked touches act otherwise at once. at_s: -inf: before the scan; inf: one that was taken for ended goes on.
+    share: of their action after that; 0: they ended.
     """
 
-    touch: int
+    touches: tuple[int, ...]
     at_s: float
     share: float
+    chi2: float  # that it leaves, in all
+
+
+def _least(steps: Sequence[StrengthStep], below: float) -> StrengthStep | None:
+    """The one that leaves least, and less than that."""
+    best = min(steps, key=lambda step: step.chi2, default=None)
+    return best if best is not None and best.chi2 < below else None
+
+
+def _together(tracked: Priors) -> Iterator[tuple[int, ...]]:
+    """Which touches may change at once: each, and of those that have not ended any that are lifted by one hand."""
+    lasting = [k for k, prior in enumerate(tracked) if prior.until_s == np.inf]
+    yield from ((k,) for k in range(len(tracked)))
+    for count in range(2, len(lasting) + 1):
+        yield from combinations(lasting, count)
 
 
 def _releases(
@@ -186,6 +201,18 @@ class Hypotheses:
             return best
         return replace(best, over=best.score - max(answer.score for answer in answers if answer.fit is None))
 
+    def of_fewer(self, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
+        """The likeliest of an answer's touches: all, or without one of the new ones, or without any of these."""
+        priors, places = started(answer.fit), answer.association
+        new = [k for k, place in enumerate(places) if place < 0]
+        found = list[ScoredAnswer]()
+        for without in sorted({(), tuple(new), *((k,) for k in new)}, key=len, reverse=True):
+            stay = [k for k in range(len(priors)) if k not in without]
+            association = tuple(places[k] for k in stay)
+            fewer = [priors[k] for k in stay]
+            found.append(self.fitted(innovation, fewer, association) if stay else self.untouched(innovation))
+        return likeliest(found)
+
     def on_electrode(self, innovation: Innovation, place: Array, second: Array) -> ScoredAnswer:
         """The likeliest small touch at a place (2,). second (K, n): what one does there by the square of its action."""
         out = place / max(float(np.hypot(*place)), LEAST_ACTION)
@@ -208,8 +235,17 @@ class Hypotheses:
         if not association:
             return likeliest(self._untouched(innovation, (DRIFT, MEMORY)))
         priors = [tracked[k] for k in association]
+        added = {
+            cause: more
+            for cause in (DRIFT, MEMORY)
+            if (more := self._more(innovation, cause, innovation.y)) is not None
+        }
+        widest = replace(innovation, covariance=innovation.covariance + sum(added.values()))
+        found = self.fitted(widest, priors, association, n.STEPS_WARM)
+        if not found.quiet:  # what all causes together do not explain, none of them does
+            return found
         answers = [self.fitted(innovation, priors, association, n.STEPS_WARM)]
-        for cause in (DRIFT, MEMORY):
+        for cause in added:
             answers += self.with_cause(innovation, priors, association, cause, innovation.y, n.STEPS_WARM)
         return likeliest(answers)
 
@@ -219,7 +255,8 @@ class Hypotheses:
         for begun in (innovation.candidates, self._begun_otherwise(innovation, innovation.candidates)) if count else ():
             if begun is not None and not _settled(innovation, found):
                 found.append(self.fitted(innovation, begun, (-1,) * count, n.STEPS_WARM))
-        settled = innovation.spent or (count == 1 and _settled(innovation, found))
+        # No later scan asks again how many touch in one that stands by itself.
+        settled = innovation.spent or (_settled(innovation, found) and not (count > 1 and innovation.scan.separate))
         return found if settled else [*found, *self.search(innovation)]
 
     def _of_tracked(self, innovation: Innovation, tracked: Priors, manoeuvring: Priors) -> list[ScoredAnswer]:
@@ -397,13 +434,16 @@ class Hypotheses:
         assert outlined.fit is not None
         best = max(outlined.score, discs.score) if innovation.whole else outlined.score
         found = [replace(outlined, score=best), *self._wide(innovation, outlined)]
+        if not outlined.explained:  # its steps may not have led there
+            found.append(discs)
         if (pair := neighbours(outlined.fit.states, association)) is not None:
             found += self.merged(innovation, outlined, *pair)
         return found
 
     def _wide(self, innovation: Innovation, answer: ScoredAnswer) -> list[ScoredAnswer]:
         """The same touches by a response that is wrong by more, where that is asked and theirs leaves something."""
-        if not innovation.whole or answer.chi2 <= n.GOOD:
+        wider = (MISFIT_WIDE / self._tables.wrong) ** 2
+        if not (innovation.whole and n.GOOD < answer.chi2 < wider * n.GOOD):
             return []
         return [self.fitted(innovation, started(answer.fit), answer.association, wide=True)]
 
@@ -455,7 +495,7 @@ class Hypotheses:
             if turn is None:
                 steady = acting_steadily(prior, float(prior.start[ACTION]), innovation.span_s)
                 priors[k] = replace(steady, turns_s=_turns_s(innovation))
-            elif turn.touch == k:
+            elif k in turn.touches:
                 most = max(1.0, turn.share) * float(prior.start[ACTION])
                 steady = acting_steadily(prior, most, innovation.span_s)
                 priors[k] = replace(steady, turns_s=turn.at_s, grows=turn.share > 1)
@@ -464,45 +504,47 @@ class Hypotheses:
         return [self.fitted(innovation, priors)]
 
     def _released(self, innovation: Innovation, tracked: Priors, end: StrengthStep | None) -> list[ScoredAnswer]:
-        """One of the touches ended at once within the scan, or before it; empty where none did."""
+        """Touches ended at once within the scan, or before it; empty where none did."""
         if end is None:
             return []
-        priors, association = list(tracked), list(range(len(tracked)))
-        if end.at_s > -np.inf:
-            released = priors[end.touch]
+        if end.at_s == -np.inf:
+            association = tuple(k for k in range(len(tracked)) if k not in end.touches)
+            priors = [tracked[k] for k in association]
+            return [self.fitted(innovation, priors, association) if priors else self.untouched(innovation)]
+        priors = list(tracked)
+        for k in end.touches:
             if end.at_s < np.inf:
-                released = acting_steadily(released, float(released.start[ACTION]), innovation.span_s)
-            priors[end.touch] = replace(released, until_s=end.at_s)
-        else:
-            del priors[end.touch], association[end.touch]
-        return [self.fitted(innovation, priors, tuple(association)) if priors else self.untouched(innovation)]
+                priors[k] = acting_steadily(priors[k], float(priors[k].start[ACTION]), innovation.span_s)
+            priors[k] = replace(priors[k], until_s=end.at_s)
+        return [self.fitted(innovation, priors)]
 
     def _changes(
         self, innovation: Innovation, tracked: Priors, answer: ScoredAnswer
     ) -> tuple[StrengthStep | None, StrengthStep | None]:
-        """The end of one of the touches that leaves least of a scan, and the other change of one that leaves less than
-        half as much; None where none leaves half of what they leave as they are. One that has ended did so at another
-        instant than the first values after it told, or not at all.
+        """The end of one of the touches, or of several, that leaves least of a scan, and the other change that leaves
+        less than half as much; None where none leaves half of what they leave as they are. One that has ended did so at
+        another instant than the first values after it told, or not at all.
         """
         course = TouchCourse(self.response, innovation.times_s, innovation.span_s)
         each = [course.columns(prior.start[None], [prior]).mean for prior in tracked]
         total = np.sum(each, axis=0)
-        end, turn = None, None
-        least = turned = 0.5 * self._unlike(innovation, answer, total[:, None])[0]
-        for k, prior in enumerate(tracked):
-            for at_s, before, missing in _releases(course, innovation, prior, each[k], total - each[k]):
+        ends, turns = list[StrengthStep](), list[StrengthStep]()
+        for touches in _together(tracked):
+            prior, own = tracked[touches[0]], np.sum([each[k] for k in touches], axis=0)
+            for at_s, before, missing in _releases(course, innovation, prior, own, total - own):
                 chi2 = self._unlike(innovation, answer, before[:, None] + missing)
                 at = int(chi2.argmin())
-                if chi2[at] < least:
-                    end, least = StrengthStep(k, float(at_s[at]), 0.0), float(chi2[at])
+                ends.append(StrengthStep(touches, float(at_s[at]), 0.0, float(chi2[at])))
                 if prior.until_s < np.inf:
                     continue
                 share = self._share(innovation, answer, before, missing)
                 chi2 = self._unlike(innovation, answer, before[:, None] + share * missing)
                 at = int(chi2.argmin())
-                if chi2[at] < min(turned, 0.5 * least, 0.5 * chi2[0]):  # by more than one that changed before the scan
-                    turn, turned = StrengthStep(k, float(at_s[at]), 1 - float(share[at])), float(chi2[at])
-        return end, turn if turned < 0.5 * least or end is None else None
+                if chi2[at] < 0.5 * chi2[0]:  # by more than one that changed before the scan
+                    turns.append(StrengthStep(touches, float(at_s[at]), 1 - float(share[at]), float(chi2[at])))
+        half = 0.5 * float(self._unlike(innovation, answer, total[:, None])[0])
+        end = _least(ends, half)
+        return end, _least(turns, 0.5 * (half if end is None else end.chi2))
 
     def _share(self, innovation: Innovation, answer: ScoredAnswer, change: Array, missing: Array) -> Array:
         """(n,) of what may be missing (K, n) of a change (K,), with which the residual is least."""

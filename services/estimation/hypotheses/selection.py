@@ -112,7 +112,7 @@ class HypothesisSelection:
             return answer
         separate = self.measured.scan.separate
         own = replace(innovation, budget=StepBudget.of(1.0, separate), keeps=0.0)
-        recount = SplitMergeTest(hypotheses, separate)
+        recount = SplitMergeTest(hypotheses, separate, self.skin.touches.recount_gain)
         other = found = recount(own, answer)
         while other is not None and not own.spent:
             other = recount(own, other)
@@ -130,7 +130,9 @@ class HypothesisSelection:
         if not whole or fit is None or any(prior.until_s < np.inf for prior in fit.priors):
             return False
         roughly = answer.cause != AS_IT_IS or not answer.explained or (answer.wide and -1 in answer.association)
-        return (roughly or self.skin.touches.claim_recount() or separate) and (answer.explained or self._due)
+        if not (answer.explained or self._due):  # asked then, it would count as asked
+            return False
+        return roughly or self.skin.touches.claim_recount() or separate
 
     def _of_measured(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """Of a skin whose touches no response tells surely. While nothing explains scans, all else is asked seldom."""

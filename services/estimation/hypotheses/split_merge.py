@@ -30,9 +30,11 @@ HALVED_APART = (0.6, 1.0, 1.4)  # how far each lies from its middle, in radii
 class SplitMergeTest:
     """The evidence of more touches, or of fewer, than an answer has. Of one skin, seen as its hypotheses see it."""
 
-    def __init__(self, hypotheses: Hypotheses, separate: bool) -> None:
-        """separate: of scans that stand by themselves: evidence alone decides, and no later one is asked again."""
-        self._separate, self._least_gain = separate, 0.0 if separate else float(n.RECOUNT_GAIN)
+    def __init__(self, hypotheses: Hypotheses, separate: bool, least_gain: float) -> None:
+        """separate: of scans that stand by themselves: evidence alone decides, and no later one is asked again. Of
+        others least_gain [nat] decides.
+        """
+        self._separate, self._least_gain = separate, 0.0 if separate else least_gain
         self._hypotheses = copy(hypotheses)
         self._hypotheses.wide = False  # what explains everything would hide how many there are
 
@@ -50,9 +52,8 @@ class SplitMergeTest:
         if (pair := neighbours(same[0].fit.states, new)) is not None:
             found += ask.merged(innovation, same[0], *pair)
         elif not any(other.explained and other.score > enough for other in found):
-            oddest = np.argsort([-oddness(shape) for shape in fit.shapes])
-            for one in takewhile(lambda _: not innovation.spent, oddest):
-                found += self._halved(innovation, begun, discs, int(one))
+            for one in takewhile(lambda _: not innovation.spent, self._oddest(fit)):
+                found += self._halved(innovation, begun, discs, one)
         if not any(other.explained for other in found):
             found += ask.search(innovation)
         others = [other for other in found if other.explained and _others(other.fit, fit)]
@@ -69,6 +70,12 @@ class SplitMergeTest:
         if answer.cause:
             found += ask.with_cause(innovation, begun, new, answer.cause, answer.residual)
         return found
+
+    def _oddest(self, fit: FoundTouches) -> list[int]:
+        """Which touches may be two discs, the oddest outline first: two that were followed as one are that odd."""
+        odd = [oddness(shape) for shape in fit.shapes]
+        may = [k for k in range(len(fit)) if self._separate or odd[k] > n.ODD_OUTLINE]
+        return sorted(may, key=lambda k: -odd[k])
 
     def _halved(self, innovation: Innovation, begun: Priors, discs: ScoredAnswer, one: int) -> list[ScoredAnswer]:
         """Two discs instead of one, as one beside it leads to neither. begun: the touches of those discs, outlined."""

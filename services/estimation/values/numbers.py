@@ -72,7 +72,7 @@ SURE_Z2 = Number(44.0, "-", "z^2 of a new touch that is shown", "derived: FALSE_
 
 ONSET_Z2 = Number(7.0, "-", "z^2 that a touch which began within a scan must have beyond", "derived: 2 ln of 33 onsets")
 ANOTHER = Number(15.0, "nat", "evidence that a further touch adds in a part", "derived: 650 discs in 1e4 frames, and 2")
-RECOUNT_GAIN = Number(5.0, "nat", "evidence of others than those that stand", "derived: one false in 150 askings")
+RECOUNT_GAIN = Number(5.0, "nat", "evidence of others than those that stand", "derived: one false in 150 first askings")
 ANOTHER_Z2 = Number(16.0, "-", "z^2 of a further disc that is tried by evidence", "chosen: 4 sigmas; evidence decides")
 WIDE_START = Number(4.1, "nat", "log prior that a new touch's wide start lacks", "derived: places 1.9, actions 2.2")
 LOG_PRIOR_TOUCH = Number(-3.5, "nat", "log prior of a touch that begins in a scan", "derived: one in 30 scans")
