@@ -29,7 +29,6 @@ from models.measurement.touch import (
     TouchPrior,
     X,
     Y,
-    is_anywhere,
     is_disc,
     within_limits,
 )
@@ -165,7 +164,8 @@ class TouchFitter:
         self._mean, self._precision = np.concatenate(means), np.concatenate(sds) ** -2.0
         self._states = STATES * len(self._priors)
         self._shapes = len(self._mean) - self._states
-        self._tells_after = n.TELLS_AFTER if any(is_anywhere(prior) for prior in self._priors) else 0
+        known = all((prior.sd[PLACE] < n.MOST_WAY).all() for prior in self._priors)
+        self._tells_after = 0 if known else n.TELLS_AFTER
         self.steps = 0
 
     def fit(self, most_steps: int) -> FoundTouches:
@@ -240,8 +240,8 @@ class TouchFitter:
         return point
 
     def _hopeless(self, point: _Linearisation, normal: _NormalEquations, step: Array) -> bool:
-        """Whether the linear optimum explains nothing either. Of touches that may be anywhere the first steps tell
-        little of where they end.
+        """Whether the linear optimum explains nothing either. Of touches whose place is hardly known the first steps do
+        not tell where they end.
         """
         if self.steps < self._tells_after:
             return False

@@ -87,6 +87,11 @@ class TrackedTouch:
         return self.scans % n.DOUBT_SCANS == n.DOUBT_SCANS - 1
 
     @property
+    def in_doubt(self) -> bool:
+        """Whether to ask in this whole scan if it is drift, or nothing."""
+        return not self.ended and (self.z2 < n.DOUBT_Z2 or not self.confirmed or self.doubt_due)
+
+    @property
     def contact_due(self) -> bool:
         """Whether it is time to ask if it is an electrode's contact impedance: while it is new or was otherwise of
         late, and now and then.

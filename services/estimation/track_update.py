@@ -68,7 +68,7 @@ def _may_be_two(track: TrackedTouch) -> bool:
 
 
 def _placed(track: TrackedTouch) -> bool:
-    """How strongly it presses the values since it began hardly tell: its place and that it is there, they do."""
+    """Whether its place tells it: how strongly it presses the values since it began hardly say."""
     return track.place_sd < n.PLACED and track.z2 > n.ACTS_Z2
 
 
@@ -87,14 +87,14 @@ def _doubt(skin: TaredSkin, innovation: Innovation, answer: ScoredAnswer, measur
     scans of late, so that one which only lasts is no touch yet.
     """
     touches, none = skin.touches, list[tuple[float, int]]()
-    meeting = touches.meeting(measured)
-    for k in reversed(range(len(touches))):
-        track = touches.now.tracks[k]
-        if track.ended or not (track.z2 < n.DOUBT_Z2 or not track.confirmed or track.doubt_due):
+    same = len(touches) == answer.count
+    meeting = touches.meeting(measured) if same else []
+    # As they were known before this scan: what it told counts once.
+    tracked = started(answer.fit) if same else touches.expected(measured)
+    for k, track in reversed([*enumerate(touches.now.tracks)]):
+        if not track.in_doubt:
             continue
-        tracked, least = touches.expected(measured), float(n.LOG_PRIOR_TOUCH)
-        if answer.fit is not None and k in meeting and len(touches) == len(answer.fit):
-            tracked, least = started(answer.fit), -least  # it is known by itself: it would have ended
+        least = float(-n.LOG_PRIOR_TOUCH if k in meeting else n.LOG_PRIOR_TOUCH)  # who meet would have ended
         other = skin.hypotheses.without(innovation, tracked, k)
         if other.quiet and other.score > answer.score + least and touches.stay(other.fit, other.association):
             none.append((other.score - least, k))

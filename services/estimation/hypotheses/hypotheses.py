@@ -71,16 +71,16 @@ class StrengthStep:
 
 
 def _least(steps: Sequence[StrengthStep], below: float) -> StrengthStep | None:
-    """The one that leaves least, and less than that."""
-    best = min(steps, key=lambda step: step.chi2, default=None)
+    """The one that leaves least, and less than that; each further touch must halve it."""
+    best = min(steps, key=lambda step: step.chi2 * 2 ** len(step.touches), default=None)
     return best if best is not None and best.chi2 < below else None
 
 
 def _together(tracked: Priors) -> Iterator[tuple[int, ...]]:
-    """Which touches may change at once: each, and of those that have not ended any that are lifted by one hand."""
+    """Which touches may change at once: each, and of those that have not ended all, or all but one, as by one hand."""
     lasting = [k for k, prior in enumerate(tracked) if prior.until_s == np.inf]
     yield from ((k,) for k in range(len(tracked)))
-    for count in range(2, len(lasting) + 1):
+    for count in range(max(2, len(lasting) - 1), len(lasting) + 1):
         yield from combinations(lasting, count)
 
 
@@ -127,6 +127,10 @@ class Hypotheses:
         seen._slopes = slopes
         self._through_wire = wire, seen
         return seen
+
+    @property
+    def _misfit_wide(self) -> float:
+        return max(float(MISFIT_WIDE), 2 * self._tables.wrong)
 
     def inflated_drift(self) -> Array:
         """(K, K)"""
@@ -202,16 +206,19 @@ class Hypotheses:
         return replace(best, over=best.score - max(answer.score for answer in answers if answer.fit is None))
 
     def of_fewer(self, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
-        """The likeliest of an answer's touches: all, or without one of the new ones, or without any of these."""
+        """The likeliest of an answer's touches: all, or without one of the new ones, or any: a fault may look so."""
         priors, places = started(answer.fit), answer.association
         new = [k for k, place in enumerate(places) if place < 0]
         found = list[ScoredAnswer]()
-        for without in sorted({(), tuple(new), *((k,) for k in new)}, key=len, reverse=True):
+        for without in (tuple(new), *((k,) for k in new if len(new) > 1), ()):
             stay = [k for k in range(len(priors)) if k not in without]
             association = tuple(places[k] for k in stay)
             fewer = [priors[k] for k in stay]
-            found.append(self.fitted(innovation, fewer, association) if stay else self.untouched(innovation))
-        return likeliest(found)
+            asked = (innovation, fewer, association, n.STEPS_COLD, AS_IT_IS, answer.wide or None)
+            found.append(self.fitted(*asked) if stay else self.untouched(innovation))
+        nothing = max((each.score for each in found if each.fit is None), default=-np.inf)
+        best = likeliest(found)
+        return replace(best, over=best.score - nothing, recounted=answer.recounted)
 
     def on_electrode(self, innovation: Innovation, place: Array, second: Array) -> ScoredAnswer:
         """The likeliest small touch at a place (2,). second (K, n): what one does there by the square of its action."""
@@ -255,8 +262,8 @@ class Hypotheses:
         for begun in (innovation.candidates, self._begun_otherwise(innovation, innovation.candidates)) if count else ():
             if begun is not None and not _settled(innovation, found):
                 found.append(self.fitted(innovation, begun, (-1,) * count, n.STEPS_WARM))
-        # No later scan asks again how many touch in one that stands by itself.
-        settled = innovation.spent or (_settled(innovation, found) and not (count > 1 and innovation.scan.separate))
+        again = count > 1 and innovation.scan.separate  # a search may find fewer, and no later scan is asked
+        settled = innovation.spent or (not again and _settled(innovation, found))
         return found if settled else [*found, *self.search(innovation)]
 
     def _of_tracked(self, innovation: Innovation, tracked: Priors, manoeuvring: Priors) -> list[ScoredAnswer]:
@@ -378,7 +385,7 @@ class Hypotheses:
         wide = self.wide if wide is None else wide
         course = TouchCourse(self.response, innovation.times_s, innovation.span_s)
         live, tables = int(innovation.live.sum()), self._tables
-        misfit = max(float(MISFIT_WIDE), 2 * tables.wrong) if wide else tables.wrong
+        misfit = self._misfit_wide if wide else tables.wrong
         covariance = innovation.covariance if tables.map is None else innovation.covariance + tables.map.error
         sample_s = innovation.sample_s - innovation.middle_s
         scene = FittedScan(innovation.y, covariance, course, tables.misfit, live, known, turned, sample_s)
@@ -442,7 +449,7 @@ class Hypotheses:
 
     def _wide(self, innovation: Innovation, answer: ScoredAnswer) -> list[ScoredAnswer]:
         """The same touches by a response that is wrong by more, where that is asked and theirs leaves something."""
-        wider = (MISFIT_WIDE / self._tables.wrong) ** 2
+        wider = (self._misfit_wide / self._tables.wrong) ** 2
         if not (innovation.whole and n.GOOD < answer.chi2 < wider * n.GOOD):
             return []
         return [self.fitted(innovation, started(answer.fit), answer.association, wide=True)]

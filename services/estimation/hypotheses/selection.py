@@ -132,7 +132,7 @@ class HypothesisSelection:
         roughly = answer.cause != AS_IT_IS or not answer.explained or (answer.wide and -1 in answer.association)
         if not (answer.explained or self._due):  # asked then, it would count as asked
             return False
-        return roughly or self.skin.touches.claim_recount() or separate
+        return self.skin.touches.claim_recount() or roughly or separate
 
     def _of_measured(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """Of a skin whose touches no response tells surely. While nothing explains scans, all else is asked seldom."""

@@ -52,7 +52,7 @@ class SplitMergeTest:
         if (pair := neighbours(same[0].fit.states, new)) is not None:
             found += ask.merged(innovation, same[0], *pair)
         elif not any(other.explained and other.score > enough for other in found):
-            for one in takewhile(lambda _: not innovation.spent, self._oddest(fit)):
+            for one in takewhile(lambda _: not innovation.spent, self._odd_ones(fit)):
                 found += self._halved(innovation, begun, discs, one)
         if not any(other.explained for other in found):
             found += ask.search(innovation)
@@ -71,10 +71,12 @@ class SplitMergeTest:
             found += ask.with_cause(innovation, begun, new, answer.cause, answer.residual)
         return found
 
-    def _oddest(self, fit: FoundTouches) -> list[int]:
-        """Which touches may be two discs, the oddest outline first: two that were followed as one are that odd."""
+    def _odd_ones(self, fit: FoundTouches) -> list[int]:
+        """Which touches may be two discs, the oddest outline first: two that were followed as one are odd, where
+        outlines are fitted.
+        """
         odd = [oddness(shape) for shape in fit.shapes]
-        may = [k for k in range(len(fit)) if self._separate or odd[k] > n.ODD_OUTLINE]
+        may = [k for k in range(len(fit)) if self._separate or odd[k] > n.ODD_OUTLINE or not fit.shapes[k].any()]
         return sorted(may, key=lambda k: -odd[k])
 
     def _halved(self, innovation: Innovation, begun: Priors, discs: ScoredAnswer, one: int) -> list[ScoredAnswer]:
