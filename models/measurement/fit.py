@@ -50,7 +50,7 @@ class KnownWhitening:
     size2: float
 
     def fits(self, size2: float, times: float) -> bool:
-        """Whether the misfit of touches of another squared change is the same, but for so many times."""
+        """Whether it does for touches of another squared change: one that differs by less than so many times."""
         return 1 / times < size2 / self.size2 < times
 
 
@@ -184,7 +184,7 @@ class TouchFitter:
         if moved or changed:
             point = self._descend(self._linearised(point.states, rest, self._columns(point.states, rest)), most_steps)
         if self._known is not self._scene.known and not self._known.fits(_size2(point.columns), SIZE_SAME):
-            # Another one's misfit would make their evidence another by some nats.
+            # The misfit of a stronger or weaker touch shifts the evidence by some nats.
             self._whiten(point.states, point.columns)
             point = self._linearised(point.states, point.rest, point.columns)
         return self._posterior(point)

@@ -91,6 +91,7 @@ class FaultIsolation:
         touched, nearby = self._standing_change(standing)
 
         def ask(other: Innovation) -> ScoredAnswer:
+            # New touches were just searched for; what a fault hid of them the next scan tells, where one follows.
             if found.answer.explained and -1 in found.answer.association and not self._at.scan.separate:
                 return hypotheses.of_fewer(other, found.answer)
             again = replace(other, candidates=likely, places=found.answer.association)

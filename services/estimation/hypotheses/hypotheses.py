@@ -71,9 +71,9 @@ class StrengthStep:
 
 
 def _least(steps: Sequence[StrengthStep], below: float) -> StrengthStep | None:
-    """The one that leaves least, and less than that; each further touch must halve it."""
-    best = min(steps, key=lambda step: step.chi2 * 2 ** len(step.touches), default=None)
-    return best if best is not None and best.chi2 < below else None
+    """Of those that leave less than that the one that leaves least, where each further touch must halve it."""
+    enough = [step for step in steps if step.chi2 < below]
+    return min(enough, key=lambda step: step.chi2 * 2 ** len(step.touches), default=None)
 
 
 def _together(tracked: Priors) -> Iterator[tuple[int, ...]]:
@@ -130,6 +130,7 @@ class Hypotheses:
 
     @property
     def _misfit_wide(self) -> float:
+        """Share of a touch's change that a response gets wrong which is wrong by more than it should be."""
         return max(float(MISFIT_WIDE), 2 * self._tables.wrong)
 
     def inflated_drift(self) -> Array:
@@ -209,13 +210,12 @@ class Hypotheses:
         """The likeliest of an answer's touches: all, or without one of the new ones, or any: a fault may look so."""
         priors, places = started(answer.fit), answer.association
         new = [k for k, place in enumerate(places) if place < 0]
-        found = list[ScoredAnswer]()
+        found, wide = list[ScoredAnswer](), answer.wide or None
         for without in (tuple(new), *((k,) for k in new if len(new) > 1), ()):
             stay = [k for k in range(len(priors)) if k not in without]
             association = tuple(places[k] for k in stay)
             fewer = [priors[k] for k in stay]
-            asked = (innovation, fewer, association, n.STEPS_COLD, AS_IT_IS, answer.wide or None)
-            found.append(self.fitted(*asked) if stay else self.untouched(innovation))
+            found.append(self.fitted(innovation, fewer, association, wide=wide) if stay else self.untouched(innovation))
         nothing = max((each.score for each in found if each.fit is None), default=-np.inf)
         best = likeliest(found)
         return replace(best, over=best.score - nothing, recounted=answer.recounted)
@@ -242,17 +242,13 @@ class Hypotheses:
         if not association:
             return likeliest(self._untouched(innovation, (DRIFT, MEMORY)))
         priors = [tracked[k] for k in association]
-        added = {
-            cause: more
-            for cause in (DRIFT, MEMORY)
-            if (more := self._more(innovation, cause, innovation.y)) is not None
-        }
-        widest = replace(innovation, covariance=innovation.covariance + sum(added.values()))
+        more = [self._more(innovation, cause, innovation.y) for cause in (DRIFT, MEMORY)]
+        widest = replace(innovation, covariance=innovation.covariance + sum(each for each in more if each is not None))
         found = self.fitted(widest, priors, association, n.STEPS_WARM)
         if not found.quiet:  # what all causes together do not explain, none of them does
             return found
         answers = [self.fitted(innovation, priors, association, n.STEPS_WARM)]
-        for cause in added:
+        for cause in (DRIFT, MEMORY):
             answers += self.with_cause(innovation, priors, association, cause, innovation.y, n.STEPS_WARM)
         return likeliest(answers)
 
@@ -448,7 +444,7 @@ class Hypotheses:
         return found
 
     def _wide(self, innovation: Innovation, answer: ScoredAnswer) -> list[ScoredAnswer]:
-        """The same touches by a response that is wrong by more, where that is asked and theirs leaves something."""
+        """The same touches by a response that is wrong by more, where theirs leaves something that it may explain."""
         wider = (self._misfit_wide / self._tables.wrong) ** 2
         if not (innovation.whole and n.GOOD < answer.chi2 < wider * n.GOOD):
             return []
@@ -493,7 +489,7 @@ class Hypotheses:
         return priors
 
     def _turned(self, innovation: Innovation, tracked: Priors, turn: StrengthStep | None) -> list[ScoredAnswer]:
-        """Strengths changed at once: that of one in mid-scan, or any at its end, as they go or are pressed harder."""
+        """Strengths changed at once: some in mid-scan, or any at its end, as they go or are pressed harder."""
         priors = list(tracked)
         for k, prior in enumerate(tracked):
             # Until then it acts as it did, since a scan before this one: else two that begin would look like one.
