@@ -373,7 +373,7 @@ class ScanStep:
         if not answer.nearly_holds:
             return tuple(coasted(touch, passed_s) for touch in published)
         unexplained = float(np.linalg.norm(answer.residual)) / max(float(np.linalg.norm(innovation.y)), n.TINY)
-        lasting = [track for track in now.tracks if track.confirmed and track.acts_at(sample_s)]
+        lasting = [track for track in now.tracks if track.confirmed and track.acts_at(sample_s, self.measured.end_s)]
         open_ids = [track.id for track in (*now.tracks, *now.dropped) if not track.confirmed]
         return (
             *(track.estimate(sample_s, self.measured.span_s, unexplained) for track in lasting),

@@ -126,10 +126,12 @@ class TrackedTouch:
         """By the last scan, of the coordinate that is known worse."""
         return float(np.sqrt(max(self.covariance[X, X], self.covariance[Y, Y], 0.0)))
 
-    def acts_at(self, at_s: float) -> bool:
-        """Whether it is there at an instant of the scan that it was fitted to: it may have ended after that."""
+    def acts_at(self, at_s: float, end_s: float) -> bool:
+        """Whether it is there at an instant of the scan that it was fitted to. end_s: of the scan: what ended at once
+        before is gone, what fades is there as at that instant.
+        """
         acts = float(self.state[ACTION] + self.state[RATE] * (at_s - self.at_s))
-        return not self.ended or (at_s < self.until_s and acts > n.ENDED * self.peak)
+        return not self.ended or (end_s <= self.until_s and acts > n.ENDED * self.peak)
 
     def has_ended(self, span_s: float) -> bool:
         """By what acts at the scan's end, never by the drop alone: its sigma is that of the radius."""

@@ -119,9 +119,6 @@ def test_three_tips_that_begin_in_the_same_instant_are_never_one_between_two(par
     assert shows(between_s(shown, FREE_S + 0.15), 3)
 
 
-# touches that change
-
-
 def way(x, to, y, points):
     """Shares of a way, and |Z| there."""
     shares = np.linspace(0, 1, points)
@@ -152,6 +149,13 @@ def test_a_touch_whose_force_changes_at_once_goes_on(parts, first_n, then_n, ram
     assert shows(shown, 1) and len(ids(shown)) == 1
 
 
+@pytest.mark.parametrize("phase", [0.3, 0.7])
+def test_a_whole_scan_within_which_a_touch_is_lifted_does_not_show_it(phase):
+    ends = 100 * curves.SCAN_S
+    frames = run(press(TOUCH, ramp_s=1e-3, until_s=ends + phase * curves.SCAN_S), ends + 3 * curves.SCAN_S)
+    assert shows(between_s(frames, ends - 0.3, ends), 1) and shows(between_s(frames, ends), 0)
+
+
 @BOTH
 def test_what_a_touch_leaves_in_the_foam_is_no_touch(parts):
     frames = run(press(TOUCH, until_s=FREE_S + 1.0, left=0.03), FREE_S + (3.5 if parts == 1 else 2.5), parts)
@@ -169,9 +173,6 @@ def test_after_refused_frames_the_skin_is_valid_again_within_two_seconds():
     frames = run(curve, ends + 2.5)
     assert sum(frame.valid for frame in between_s(frames, FREE_S + 0.5, ends)) <= 1
     assert shows(between_s(frames, ends + 2), 0)
-
-
-# what is measured
 
 
 @pytest.mark.parametrize(("parts", "since"), [(1, 0.0), (PARTS, FREE_S)])

@@ -191,9 +191,6 @@ def test_a_tare_makes_no_contact_and_is_followed_by_touches_again(host):
     assert next(t for t, f in during(host, 0.1) if f.valid and f.contacts) < 0.025
 
 
-# begin and end stay long enough for a reader that takes the newest frame now and then
-
-
 def test_a_reader_of_30_hz_misses_neither_begin_nor_end(host):
     host.press(x=0.01, y=0.02, force=2.0, radius=0.01, seconds=0.2)
     seen = during(host, 0.6)

@@ -282,8 +282,11 @@ class Hypotheses:
         end, turn = self._changes(innovation, tracked, unchanged)
         late = end is None or end.at_s > _turns_s(innovation) + TURN_STEPS[0]
         ways = (self._released, end), (self._turned, turn)
-        for how, change in reversed(ways) if late else ways:
-            yield how(innovation, tracked, change)
+        if late and innovation.whole:  # no part follows that tells them apart
+            yield [answer for how, change in ways for answer in how(innovation, tracked, change)]
+        else:
+            for how, change in reversed(ways) if late else ways:
+                yield how(innovation, tracked, change)
         yield [self.fitted(innovation, manoeuvring)]
 
     def _beside_tracked(

@@ -188,6 +188,7 @@ class TaringState:
     judgements: tuple[Judgement, ...] = ()  # of the baseline, or of why there is none
     doubted: bool = False  # the baseline's word against a touch counts for nothing
     surely: bool = False  # a touch explains the first scans
+    pressed: Annotated[Array | None, "K"] = None  # log |Z| of the first scans, as they were judged touched
     problem: str = ""  # what stands in the way of valid frames, for a person
     wire: WireFault | None = None  # before the first baseline
 
@@ -241,14 +242,22 @@ class Taring:
         except NoBaseline as why:
             self.now.problem = f"no baseline yet: {why}"
             return None
-        start = self._judged(scans, earlier)
-        self.now.judgements = (*scans.judgements, *start.judgements)
-        self.now.surely = start.sure
-        if start.says is StartSays.TOUCHED:
-            self.now.problem = PRESSED.format(" --force" * start.sure)
+        start = None if self._still_pressed(scans) else self._judged(scans, earlier)
+        if start is not None:
+            self.now.judgements, self.now.surely = (*scans.judgements, *start.judgements), start.sure
+        if start is None or start.says is StartSays.TOUCHED:
+            self.now.pressed = scans.log_z0 if start is not None else self.now.pressed
+            self.now.problem = PRESSED.format(" --force" * self.now.surely)
             return None
         self._taken(scans, start)
         return scans
+
+    def _still_pressed(self, scans: AgreedScans) -> bool:
+        """Whether they are those that were judged touched, within one scan's noise: the same would be said again."""
+        if self.now.pressed is None:
+            return False
+        off = (scans.log_z0 - self.now.pressed) / scans.scatter
+        return bool((off[scans.live] ** 2).mean() < 1)
 
     def _judged(self, scans: AgreedScans, earlier: EarlierBaseline | None) -> JudgedStart:
         variance = (scans.residuals**2).mean(axis=0) / len(scans.residuals)
@@ -283,7 +292,7 @@ class Taring:
 
     def _taken(self, scans: AgreedScans, start: JudgedStart | None) -> None:
         now = self.now
-        now.surely, now.untouched, now.touched, now.problem = False, 0, False, ""
+        now.surely, now.untouched, now.touched, now.problem, now.pressed = False, 0, False, "", None
         turned = {each.name: each.statistic for each in now.judgements if each.ratio >= 1}
         now.doubted = bool(turned)
         if "noise_trained" in turned:
