@@ -175,6 +175,7 @@ class NoiseState:
     white: float
     flicker: Annotated[Array, "E"]  # of a contact impedance, common to a scan
     jitter: Annotated[Array, "E"]  # of a contact impedance, new with each measurement
+    jumps: Annotated[Array, "E"]  # of a contact impedance that jumps: its flicker at least
 
 
 class NoiseModel:
@@ -185,7 +186,7 @@ class NoiseModel:
         self._squares = tables.contact**2
         self._weight = np.maximum((self._squares**2).sum(axis=0), n.TINY)
         e = tables.electrodes
-        self.now = NoiseState(float(n.WHITE**2), np.full(e, n.FLICKER_FLOOR**2), np.zeros(e))
+        self.now = NoiseState(float(n.WHITE**2), np.full(e, n.FLICKER_FLOOR**2), np.zeros(e), np.zeros(e))
         self.lines = Lines(tables.measurements)
 
     def begin(self, residuals: Array, parts: tuple[int, ...]) -> None:
@@ -256,7 +257,8 @@ class NoiseModel:
         flicker = (
             np.minimum(moved, n.OUTLIER / information + n.OUTLIER * self.now.flicker).mean(axis=0) - 1 / information
         )
-        self.now.flicker = np.maximum(n.FLICKER_FLOOR**2, self.now.flicker + share * flicker)
+        least = np.maximum(n.FLICKER_FLOOR**2, self.now.jumps)
+        self.now.flicker = np.maximum(least, self.now.flicker + share * flicker)
         excess = self._excess(weighted_residual, white.conditional_precisions()).mean(axis=0)
         jitter = self.now.jitter + share * (self._squares * excess[:, None]).sum(axis=0) / self._weight
         self.now.jitter = np.where(jitter > n.JITTER_FLOOR**2, jitter, 0.0)

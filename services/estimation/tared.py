@@ -88,7 +88,7 @@ class TaredSkin:
         self.null_gate = NullGate(self.hypotheses.grid, self.noise, self.drift)
         self.grid_information: GridInformation | None = None
         self.aged = list[FilterState]()
-        self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live)
+        self.faults = BoardFaults(self.tables, any_touches(self.hypotheses.grid), self.live, self.noise)
 
     def begin(self, scans: AgreedScans) -> None:
         """scans: those of the baseline."""

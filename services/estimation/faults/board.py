@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.fit import FoundTouches
+from models.measurement.noise import NoiseModel
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
 from models.measurement.whitening import Whitening, leave_out
@@ -127,11 +128,11 @@ class Explanation:
 class BoardFaults:
     """Of one skin."""
 
-    def __init__(self, tables: SkinTables, any_touch: Array, known: Mask) -> None:
+    def __init__(self, tables: SkinTables, any_touch: Array, known: Mask, noise: NoiseModel) -> None:
         """any_touch (K, K): covariance of log |Z| over touches that may be anywhere. known (K,): measurements that the
-        baseline has; the others count not, whatever they show.
+        baseline has; the others count not, whatever they show. noise: of the same skin, contacts that jump included.
         """
-        self._any_touch, self._known = any_touch, known
+        self._any_touch, self._known, self._noise = any_touch, known, noise
         self.member = wires.members(tables.pattern)
         self.maps = WireMaps(tables.pattern)
         self._table = WireTable(self.maps)
@@ -293,12 +294,13 @@ class BoardFaults:
         odds = self._least_odds(answer) if doubted is None else n.LOG_PRIOR_TOUCH + n.LOG_PRIOR_SMALL * _small(doubted)
         best, least = None, answer.score + odds
         for k, change in enumerate(changes, 1):
-            asked, column = self._given(innovation.leaving(1 - k / len(changes)), columns, change)
+            asked, unknown = self._given(innovation.leaving(1 - k / len(changes)), columns, change)
             found = ask(asked)
             goes_on = not change.is_gain and change.electrode == self.now.contact and self.began_within(view)
             score = found.score + (0.0 if goes_on else change.log_prior)
-            if score >= least and self._believed(change, column, found, score, answer):
-                best, least = (change, column, asked, found), score
+            tells = unknown if odds < 0 else unknown[:, :1]  # instead of a touch also what it does within the scan
+            if score >= least and self._believed(change, tells, found, score, answer):
+                best, least = (change, unknown[:, 0], asked, found), score
         if best is None:
             return None
         change, column, asked, found = best
@@ -307,19 +309,20 @@ class BoardFaults:
             self.now.doubt.beside = self._beside(change, found)
         return Explanation(view, asked, found, changed=True)
 
-    def _believed(self, change: Change, column: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer) -> bool:
-        """Whether a change may be believed that is likely enough. column (K,): of unit variance of what it may be;
-        found: the answer with it, and its score; answer: the one without.
+    def _believed(
+        self, change: Change, unknown: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer
+    ) -> bool:
+        """Whether a change may be believed that is likely enough. unknown (K, n): columns of unit variance of what it
+        may be; found: the answer with it, and its score; answer: the one without.
         """
         if not self._apart(change, found):
             return False
         if self._beside(change, found) and score < answer.score + n.FAULT_SURE:
             return False  # a touch takes the contact along: both are not likelier for being seldom touches
-        sigmas = float(column @ found.weighted_residual)
         if change.is_gain:
-            significant = abs(sigmas) * n.GAIN_CHANGES >= n.GAIN_LEAST
+            significant = abs(float(unknown[:, 0] @ found.weighted_residual)) * n.GAIN_CHANGES >= n.GAIN_LEAST
         else:
-            significant = sigmas**2 > n.ACTS_Z2 * max(1 - found.information(column), 0.0)
+            significant = found.z2(unknown) > n.ACTS_Z2
         if not significant:  # the touches of the answer explain all of it
             return False
         return found.holds or (self._tells and found.chi2 < n.MOST and score > answer.score + n.WIRE_SURE)
@@ -402,17 +405,17 @@ class BoardFaults:
         return [*found, *columns.likeliest(scan)]
 
     def _given(self, innovation: Innovation, of_contacts: ContactColumns, change: Change) -> tuple[Innovation, Array]:
-        """The innovation beside a change of any size, and its column (K,) of unit variance."""
+        """The innovation beside a change of any size, and its columns (K, n) of unit variance, the size's own first."""
         acts = np.asarray(innovation.live & (innovation.times_s >= change.since_s), float)
         if change.is_gain:
             column = n.GAIN_CHANGES * acts
-            return replace(innovation, covariance=innovation.covariance + np.outer(column, column)), column
+            return replace(innovation, covariance=innovation.covariance + np.outer(column, column)), column[:, None]
         course = 2 * innovation.times_s / innovation.span_s
         y, columns = of_contacts.taken_off(innovation.y, acts, course, change)
         wider = innovation.covariance + columns @ columns.T
         misfit = n.CONTACT_MISFIT * acts * of_contacts.mean(change.electrode, change.size)
         wider[np.diag_indices_from(wider)] += misfit**2
-        return replace(innovation, y=np.where(innovation.live, y, 0.0), covariance=wider), columns[:, 0]
+        return replace(innovation, y=np.where(innovation.live, y, 0.0), covariance=wider), columns
 
     def _apart(self, change: Change, answer: ScoredAnswer) -> bool:
         """An electrode under a touch that changes is not named: what it does is the touch's. One that stood may change
@@ -447,11 +450,11 @@ class BoardFaults:
             if well or not (now.doubt.undecided or self.began_within(view)):  # else no scan confirmed it
                 self._settle()
         if now.contact != change.electrode:
-            now.doubt = ContactState()
+            now.doubt = ContactState(jumps=float(np.sqrt(self._noise.now.jumps[change.electrode])))
         now.contact, now.contact_since_s, now.size_before = change.electrode, since_s, before
         now.size = max(before + n.CONTACT_CHANGES * sigmas, self._least_size)
         if now.size > before and not now.doubt.undecided:
-            now.doubt.begin(before)
+            now.doubt.change(before, now.size)
         now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
         now.still_s, now.still_size, now.back_scans = 0.0, now.size, 0
 
@@ -493,12 +496,13 @@ class BoardFaults:
         self._time_still(passed_s)
         now.back_scans = (now.back_scans + whole) if abs(now.size - home) < unsure else 0
         now.variance += (n.CONTACT_WALK_CHANGED * self._impedance) ** 2 * min(passed_s / SCAN_S, 1.0)
-        drifts = view.at.middle_s < now.doubt.drifts_until_s
+        if view.at.middle_s < now.doubt.drifts_until_s:
+            return
         settles_s = n.UNDECIDED_SETTLES_S if now.doubt.undecided else n.CONTACT_SETTLES_S
-        back = now.back_scans >= n.BACK_SCANS or now.doubt.stays(home)
-        if not drifts and (back or now.still_s > settles_s):
-            # One scan's size is off by its noise, and nothing would take that back.
-            now.size = home if back else now.doubt.lately(view.at.middle_s)
+        if now.back_scans >= n.BACK_SCANS or now.doubt.stays(home):
+            self._come_back(home)
+        elif now.still_s > settles_s:
+            now.size = now.doubt.lately(view.at.middle_s)  # one scan's is off by its noise, and nothing takes that back
             self._settle()
 
     def remember(self, residual: Array, whole: bool) -> None:
@@ -549,6 +553,27 @@ class BoardFaults:
     def _least_size(self) -> float:
         """Change of a contact that leaves hardly anything of its impedance."""
         return LEAST * (1 + float(self.now.settled[self.now.contact]))
+
+    def end_doubt(self, jumped: bool) -> None:
+        """What has changed is the contact's, all of it. jumped: from one scan to the next."""
+        now = self.now
+        if jumped:
+            self._note_jump(now.size - now.doubt.decided)
+        now.doubt.end(now.size)
+
+    def _note_jump(self, size: float) -> None:
+        """The changed contact jumped by so much."""
+        doubt = self.now.doubt
+        doubt.jumps = max(doubt.jumps, size)
+        self._noise.now.jumps[self.now.contact] = doubt.jumps**2
+
+    def _come_back(self, home: float) -> None:
+        """A contact is well again by itself. It jumps, where that was by no more than the scans of a baseline may."""
+        size = max((each.size for each in self.now.doubt.sizes), default=0.0)
+        if size < n.TARE_JUMPS:
+            self._note_jump(size)
+        self.now.size = home
+        self._settle()
 
     def drop_contact(self) -> None:
         """No contact has changed."""

@@ -64,9 +64,9 @@ class ContactOrTouchTest:
             return None
         touch = self._touch(asked)
         odds = contact.score - touch.score
-        jumped = odds > n.FAULT_SURE and self._jumped(asked, contact) and _unseen(found.innovation, touch)
+        jumped = odds > n.FAULT_SURE and _unseen(found.innovation, touch) and self._jumped(asked, contact)
         if odds > n.CONTACT_DECIDED or jumped:
-            doubt.end(faults.size)
+            self._faults.end_doubt(jumped)
         elif odds < -n.FAULT_SURE and touch.explained:
             return touch.fit
         return None

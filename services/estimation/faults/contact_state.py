@@ -37,10 +37,14 @@ class ContactState:
     pace: float = 0.0  # of a contact that drifts [1/s]
     drifts_until_s: float = -np.inf  # as far as is known
     beside: bool = False  # a touch reached the electrode when it changed: what looks like a contact may be the touch's
+    jumps: float = 0.0  # by how much it has jumped before, and no touch was seen
     unsure: float = 0.0  # by how much a scan's size may be off by its noise alone, with nothing to be seen of a touch
 
-    def begin(self, decided: float) -> None:
-        """A contact has changed, or changes anew: beyond `decided` nobody knows why."""
+    def change(self, decided: float, size: float) -> None:
+        """A contact has changed, or changes anew: beyond `decided` nobody knows why, unless it jumps once more."""
+        if size - decided < self.jumps + self.least:
+            self.end(size)
+            return
         self.undecided, self.decided = True, decided
         self.over, self.scans, self.seen = None, 0, 0
 
@@ -81,7 +85,7 @@ class ContactState:
         if self.stays(home):
             self.drifts_until_s = at_s
         if not self.undecided and size - self.decided > least:
-            self.begin(self.decided)
+            self.change(self.decided, size)
 
     def lately(self, at_s: float) -> float:
         """Mean size of the last scans."""
