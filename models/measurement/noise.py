@@ -229,7 +229,7 @@ class NoiseModel:
         steady = self._squares @ self.now.jitter < 0.2 * self.now.white
         if steady.any():
             change = n.LEARNING_WHITE * float(excess[steady].mean())
-            self.now.white = float(np.clip(self.now.white + change, 0.8 * self.now.white, 1.25 * self.now.white))
+            self.now.white = float(np.clip(self.now.white + change, 0.8 * self.now.white, self.now.white / 0.8))
 
     def learn_contacts(self, weighted_residual: Array, white: Whitening) -> None:
         """Follow the contacts' noise alone, as far as a touch that is there leaves it to be seen."""

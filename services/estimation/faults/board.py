@@ -14,8 +14,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.fit import FoundTouches
+from models.measurement.fit import LEAST_MEAN, FoundTouches
 from models.measurement.noise import NoiseModel
+from models.measurement.numbers import SCAN_S
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
 from models.measurement.whitening import Whitening, leave_out
@@ -30,9 +31,6 @@ from services.estimation.values import numbers as n
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Ask = Callable[[Innovation], ScoredAnswer]
-
-LEAST = -0.95  # relative: nothing takes all of an impedance away
-SCAN_S = 0.044
 
 
 @dataclass
@@ -93,7 +91,7 @@ class BoardView:
         """(K,) log |Z| over what is predicted without touches."""
         left = self.log_z - self.shown
         if self.apart:
-            left = np.log1p(np.maximum(np.expm1(np.minimum(left, MOST_LOG)) - self.mean, LEAST))
+            left = np.log1p(np.maximum(np.expm1(np.minimum(left, MOST_LOG)) - self.mean, LEAST_MEAN))
         return np.where(self.live, left, 0.0)
 
     def covariance(self, skin: Array, own: Array) -> Array:
@@ -161,7 +159,7 @@ class BoardFaults:
         """(K,) log |Z| over an untouched skin without what the board and contacts have for good. over (K,)."""
         left = over - self.now.log_gain
         if self.now.settled.any():
-            left = np.log1p(np.maximum(np.expm1(left) - self.columns.settled_mean(), LEAST))
+            left = np.log1p(np.maximum(np.expm1(left) - self.columns.settled_mean(), LEAST_MEAN))
         return np.asarray(left)
 
     # --- what it makes of a scan ---
@@ -552,7 +550,7 @@ class BoardFaults:
     @property
     def _least_size(self) -> float:
         """Change of a contact that leaves hardly anything of its impedance."""
-        return LEAST * (1 + float(self.now.settled[self.now.contact]))
+        return LEAST_MEAN * (1 + float(self.now.settled[self.now.contact]))
 
     def end_doubt(self, jumped: bool) -> None:
         """What has changed is the contact's, all of it. jumped: from one scan to the next."""

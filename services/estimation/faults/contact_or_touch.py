@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.fit import FoundTouches
+from models.measurement.fit import LEAST_MEAN, FoundTouches
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION
 from models.measurement.whitening import leave_out
-from services.estimation.faults.board import LEAST, BoardFaults, BoardView, Explanation
+from services.estimation.faults.board import BoardFaults, BoardView, Explanation
 from services.estimation.faults.impedance import Change, Unexplained
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import AS_IT_IS, MEMORY, Innovation, ScoredAnswer, StepBudget
@@ -100,7 +100,7 @@ class ContactOrTouchTest:
         known = faults.columns.settled_mean() + faults.columns.mean(faults.now.contact, faults.now.doubt.decided)
         touched = np.exp(view.y) - np.exp(answer.residual)
         left = np.expm1(np.minimum(view.log_z - view.sound, n.MISFIT_MOST)) - touched - known
-        return np.where(view.live, np.log1p(np.maximum(left, LEAST)), 0.0)
+        return np.where(view.live, np.log1p(np.maximum(left, LEAST_MEAN)), 0.0)
 
     def _contact(self, asked: Innovation) -> Change:
         now = self._faults.now

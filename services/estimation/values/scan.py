@@ -13,7 +13,8 @@ from protocol.frames import RawFrame, as_sent
 
 Array = NDArray[np.float64]
 
-NANOSECOND, US, PER_S = 1e-9, 1e-6, 1e6  # of clocks [s, s, 1/s]
+NANOSECOND, US = 1e-9, 1e-6  # of clocks [s]
+PER_S = 1 / US
 SHORTEST_S, LONGEST_S = 0.005, 2.0  # of a scan that any board measures
 
 
@@ -66,7 +67,7 @@ class Scan:
             number=frame.scan,
             part=frame.part,
             end_us=end_us,
-            at_ns=sample_ns + round(newest_s / 2 * 1e9),
+            at_ns=sample_ns + round(newest_s / 2 / NANOSECOND),
             sample_ns=sample_ns,
             duration_s=duration_s,
             board=frame.board,
