@@ -120,10 +120,6 @@ class TouchTracks:
         self.now.tracks, self.now.dropped = [], []
         return memories
 
-    def forget_dropped(self) -> None:
-        """All touches are confirmed: what is found where one was dropped is a new one."""
-        self.now.dropped = []
-
     def expected(self, measured: Observation, manoeuvring: bool = False) -> list[TouchPrior]:
         """What is known of each before a scan. manoeuvring: it may have begun to move or to change."""
         at_s = measured.middle_s

@@ -99,11 +99,6 @@ class TrackedTouch:
         return (self.scans > 0 and self.since_step <= n.SURE_SCANS) or self.doubt_due
 
     @property
-    def weakened(self) -> bool:
-        """Whether it is weak, and has changed: it may have gone, and left something else."""
-        return self.z2 < n.DOUBT_Z2 and not self.still
-
-    @property
     def steady(self) -> bool:
         """Whether it has neither moved nor changed of late."""
         return self.still >= n.STILL_SCANS

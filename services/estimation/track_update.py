@@ -28,7 +28,7 @@ def update_tracks(
         if measured.whole and not (answer.recounted or measured.scan.separate):
             _doubt(skin, replace(innovation, keeps=0.0), answer, measured, strange=unexplained_s > n.CHANGING_S)
         if answer.explained and all(track.confirmed for track in touches.now.tracks):
-            touches.forget_dropped()
+            touches.now.dropped = []  # what is found where one was dropped is a new one
     skin.remember(memories)
     wide = answer.fit is not None and answer.wide
     if answer.explained and wide != skin.hypotheses.wide:
@@ -57,7 +57,9 @@ def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> No
     least_z2 = _least_z2(skin, answer, separate)
     place_tells = answer.cause == AS_IT_IS and not any(map(_may_be_two, skin.touches.now.tracks))
     for track in skin.touches.now.tracks:
-        surely = (track.z2 > least_z2 or (place_tells and _placed(track))) and not skin.faults.in_question(track.state)
+        # Its place tells it: how strongly it presses the values since it began hardly say.
+        placed = place_tells and track.place_sd < n.PLACED and track.z2 > n.ACTS_Z2
+        surely = (track.z2 > least_z2 or placed) and not skin.faults.in_question(track.state)
         waits = may_wait and (_may_be_two(track) or (track.jumped and not whole))
         track.confirmed = (track.confirmed or surely) and not waits
 
@@ -65,11 +67,6 @@ def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> No
 def _may_be_two(track: TrackedTouch) -> bool:
     """One that has just come and is broad may be two that began together, and is where neither of them is."""
     return bool(track.state[LOG_RADIUS] > np.log(n.BROAD)) and track.scans < n.SURE_SCANS
-
-
-def _placed(track: TrackedTouch) -> bool:
-    """Whether its place tells it: how strongly it presses the values since it began hardly say."""
-    return track.place_sd < n.PLACED and track.z2 > n.ACTS_Z2
 
 
 def _least_z2(skin: TaredSkin, answer: ScoredAnswer, separate: bool) -> float:
@@ -99,11 +96,7 @@ def _doubt(skin: TaredSkin, innovation: Innovation, answer: ScoredAnswer, measur
         if other.quiet and other.score > answer.score + least and touches.stay(other.fit, other.association):
             none.append((other.score - least, k))
         elif not track.confirmed and not skin.faults.in_question(track.state):
-            track.confirmed = _needed(track, alone=len(touches) == 1) and not strange
+            acts = len(touches) == 1 or track.z2 > n.ACTS_Z2  # alone: something touches, be its strength known or not
+            track.confirmed = track.scans >= n.SURE_SCANS and acts and not strange  # several scans need it
     if none:
         touches.remove(max(none)[1])
-
-
-def _needed(track: TrackedTouch, alone: bool) -> bool:
-    """Whether several scans need a touch. alone: something touches, be its strength known or not."""
-    return track.scans >= n.SURE_SCANS and (alone or track.z2 > n.ACTS_Z2)

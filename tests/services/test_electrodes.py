@@ -374,9 +374,6 @@ def test_touches_that_come_and_move_are_no_steps(skin: StubSkin) -> None:
     assert skin.pipeline.pre.health().counters["gain_steps"] == 0
 
 
-# gross ones
-
-
 @pytest.mark.parametrize("factor", [0.0, 2.4])
 def test_a_gross_gain_makes_no_touch_is_valid_again_within_two_seconds_and_ends(skin: StubSkin, factor: float) -> None:
     """All measurements times zero are no gain: a baseline that took it over was zero, and stayed so until a tare."""

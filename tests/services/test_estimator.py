@@ -119,6 +119,12 @@ def test_three_tips_that_begin_in_the_same_instant_are_never_one_between_two(par
     assert shows(between_s(shown, FREE_S + 0.15), 3)
 
 
+def test_two_that_begin_in_the_same_instant_are_two_within_a_scan_in_parts():
+    pair = pressed("circle", -0.02, 0.01, 6e-3, 2.0), pressed("circle", 0.012, -0.006, 6e-3, 1.4)
+    shown = between_s(run(press(*pair, ramp_s=0.0), FREE_S + 0.2, PARTS), FREE_S + curves.SCAN_S)
+    assert shows(shown, 2) and all(min(far_off(c, tip) for tip in pair) < 3e-3 for f in shown for c in f.contacts)
+
+
 def way(x, to, y, points):
     """Shares of a way, and |Z| there."""
     shares = np.linspace(0, 1, points)

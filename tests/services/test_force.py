@@ -119,9 +119,6 @@ def test_the_force_of_a_press_is_told_whatever_its_size(bundle: Bundle) -> None:
     assert (np.abs(sigmas) < 3).all() and np.median(sigma) < 0.06 and 0.2 < np.sqrt(np.mean(sigmas**2)) < 1.2
 
 
-# the law
-
-
 def look(**more: float) -> ImagePatch:
     return ImagePatch(**{"peak": 0.3, "peak_sigma": 0.03, "integral": 1e-4, "x": 0.0, "y": 0.0, **more})
 

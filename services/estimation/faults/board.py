@@ -209,10 +209,6 @@ class BoardFaults:
             apart=apart,
         )
 
-    def take_over(self, view: BoardView) -> None:
-        """Which electrodes answer, by the view that explains a scan."""
-        self.now.opens, self.now.lifted, self.now.silent = view.opens, view.lifted, view.silent
-
     def _contacts(self, at_s: Array, course: Array) -> tuple[Array, Array]:
         now, columns = self.now, self.columns
         mean = columns.settled_mean()

@@ -51,7 +51,7 @@ class FaultIsolation:
             found = self._explain_view(selection, self._look(view.lifted))
         if found.view.opens and faults.now.wire is None and (odd or (self._at.whole and self._touches.in_doubt)):
             found = self._try_lifted(found, selection)
-        faults.take_over(found.view)
+        faults.now.opens, faults.now.lifted, faults.now.silent = found.view.opens, found.view.lifted, found.view.silent
         if faults.asks(found.answer):
             found = self._try_faults(found, selection, standing)
         if not found.answer.nearly_holds:  # what does not explain its scan would stand beside any touch in the next one
@@ -110,7 +110,8 @@ class FaultIsolation:
             return found
         doubtful = _doubtful(found.answer)
         for k, track in enumerate(self._touches.now.tracks):
-            due = (track.contact_due or track.weakened) and not track.contact_excluded
+            weakened = track.z2 < n.DOUBT_Z2 and not track.still  # it may have gone, and left something else
+            due = (track.contact_due or weakened) and not track.contact_excluded
             if not (due or doubtful) or track.ended or not self._faults.on_electrode(track.state):
                 continue
             other = self._explain_without(found, k)

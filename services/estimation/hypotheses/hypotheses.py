@@ -404,14 +404,16 @@ class Hypotheses:
         """Further touches than those of an answer, one after the other: plain discs find them, their own outlines and
         evidence decide. outlined: the touches of that answer, free to be no discs; None: as it has them.
         """
-        found, discs = list[ScoredAnswer](), _unsearched(innovation) if before is None else before
+        white, y = innovation.white, innovation.y
+        any_touch = ScoredAnswer(AS_IT_IS, None, (), np.inf, np.inf, -np.inf, white, white.solve(y), y)  # is likelier
+        found, discs = list[ScoredAnswer](), before or any_touch
         priors = started(discs.fit) if outlined is None else list(outlined)
         while (new := self._next_disc(innovation, discs)) is not None:
             priors, association = [*priors, new], (*discs.association, -1)
             # The next parts tell one outline from two discs.
             if discs.fit is None and innovation.scan.part and new.since_s > 0:
-                found.append(self.fitted(innovation, priors, association))
-                if found[0].explained:
+                found += self._begun(innovation, priors, association)
+                if found[-1].explained:
                     break
             more = self.fitted(innovation, [*started(discs.fit), plain(new)], association)
             if more.score < discs.score + (0.0 if innovation.whole else n.ANOTHER):
@@ -421,6 +423,12 @@ class Hypotheses:
             if discs.explained and not innovation.whole:
                 break
         return found
+
+    def _begun(self, innovation: Innovation, priors: Priors, association: tuple[int, ...]) -> list[ScoredAnswer]:
+        """Touches that begin within a part; where they explain nothing, at other instants."""
+        first = self.fitted(innovation, priors, association)
+        begun = None if first.explained else self._begun_otherwise(innovation, started(first.fit))
+        return [first] if begun is None else [first, self.fitted(innovation, begun, association)]
 
     def _next_disc(self, innovation: Innovation, discs: ScoredAnswer) -> TouchPrior | None:
         """The likeliest one in what others leave; None where it would not be seen, or may not be looked for."""
@@ -479,7 +487,7 @@ class Hypotheses:
         for k in young:
             lasting = replace(priors[k], since_s=-np.inf)
             steady = lasting.start.copy()
-            steady[RATE:] = 0.0
+            steady[ACTION], steady[RATE:] = LEAST_ACTION, 0.0  # of any size: as slopes have it the middle may be none
             others = [prior for other, prior in enumerate(priors) if other != k]
             beside = course.columns(np.stack([prior.start for prior in others]), others).mean if others else 0.0
             own = course.columns(steady[None], [lasting]).mean
@@ -565,12 +573,6 @@ class Hypotheses:
         residual = np.where(innovation.live, innovation.y, 0.0)[:, None] - np.log1p(np.maximum(changes, LEAST_MEAN))
         residual[~innovation.live] = 0.0
         return np.asarray(np.sum(answer.white(residual) ** 2, axis=0))
-
-
-def _unsearched(innovation: Innovation) -> ScoredAnswer:
-    """That nothing touches, not scored: any touch is likelier."""
-    white, y = innovation.white, innovation.y
-    return ScoredAnswer(AS_IT_IS, None, (), np.inf, np.inf, -np.inf, white, white.solve(y), y)
 
 
 def _turns_s(innovation: Innovation) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.numbers import LINE_SCANS
-from models.measurement.touch import anywhere
+from models.measurement.touch import LOG_RADIUS, TouchPrior, anywhere
 from models.measurement.whitening import Whitening
 from services.estimation.faults.board import BoardView
 from services.estimation.filter import Prediction
@@ -108,6 +108,8 @@ class HypothesisSelection:
 
     def recounted(self, hypotheses: Hypotheses, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
         """An answer, or more touches, or fewer, with steps of its own: a bad one has spent those of the scan."""
+        if not self.measured.whole:
+            return self._begun_recounted(hypotheses, innovation, answer)
         if not self._recount_due(answer):
             return answer
         separate = self.measured.scan.separate
@@ -121,8 +123,32 @@ class HypothesisSelection:
             return answer
         if found.count < answer.count and self.skin.touches.meeting(self.measured):
             return answer  # they stood apart a moment ago: that they are several is known
+        return self._associated(own, found)
+
+    def _begun_recounted(self, hypotheses: Hypotheses, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
+        """Of a part: an answer, or with two touches instead of one that has just begun."""
+        if answer.fit is None or not answer.explained:
+            return answer
+        own = replace(innovation, budget=StepBudget.of(1.0, separate=False), keeps=0.0)
+        split = SplitMergeTest(hypotheses, False, float(n.RECOUNT_GAIN))
+        broad = answer.fit.states[:, LOG_RADIUS] > np.log(n.BROAD)  # not shown yet; others are, before they are asked
+        for k, (place, prior) in enumerate(zip(answer.association, answer.fit.priors, strict=True)):
+            due = (place >= 0 or broad[k]) and self._grown(prior)
+            if due and (found := split.of_begun(own, answer, k)) is not None:
+                return self._associated(innovation, found)
+        return answer
+
+    def _grown(self, prior: TouchPrior) -> bool:
+        """Whether what is measured of a touch that began within this scan has grown by 2^0.5."""
+        age, passed = 0.5 - prior.since_s / self.measured.span_s, float(self.measured.scan.new.mean())
+        grown = np.frexp(age**2)[1] > np.frexp(max(age - passed, n.TINY) ** 2)[1]
+        return bool(grown and age < 1 and prior.until_s == np.inf)
+
+    def _associated(self, own: Innovation, found: ScoredAnswer) -> ScoredAnswer:
+        """An answer whose touches are others than those that stood, or stand where one of them does."""
+        assert found.fit is not None
         association = self.skin.touches.associated(found.fit, found.association)
-        known = sum(place >= 0 for place in association)
+        known = sum(place >= 0 for place in association) - sum(place >= 0 for place in found.association)
         return replace(found, association=association, score=found.score - own.touch_log_prior * known, recounted=True)
 
     def _recount_due(self, answer: ScoredAnswer) -> bool:

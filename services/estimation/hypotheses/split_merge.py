@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import copy
-from itertools import product, takewhile
+from dataclasses import replace
+from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anywhere, plain
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import Innovation, Priors, ScoredAnswer, begun_as, likeliest, started
-from services.estimation.overlap import gaps, neighbours
+from services.estimation.overlap import apart, neighbours
 from services.estimation.track import oddness
 from services.estimation.values import numbers as n
 
@@ -53,13 +53,24 @@ class SplitMergeTest:
             found += ask.merged(innovation, same[0], *pair)
         elif not any(other.explained and other.score > enough for other in found):
             for one in takewhile(lambda _: not innovation.spent, self._odd_ones(fit)):
-                found += self._halved(innovation, begun, discs, one)
+                found += self._halved(innovation, discs, begun, one)
         if not any(other.explained for other in found):
             found += ask.search(innovation)
         others = [other for other in found if other.explained and _others(other.fit, fit)]
         if not others or likeliest(others).score < enough:
             return None
         return likeliest(others)
+
+    def of_begun(self, innovation: Innovation, answer: ScoredAnswer, one: int) -> ScoredAnswer | None:
+        """Two discs instead of one of an answer's touches, which has just begun: None where they are not likelier."""
+        assert answer.fit is not None
+        found = next(self._halved(innovation, answer, (), one), None)
+        if found is None or found.fit is None or not (found.explained and apart(found.fit.states, found.association)):
+            return None
+        priors, places = started(answer.fit), list(answer.association)
+        priors[one], places[one] = begun_as(answer.fit, innovation.span_s)[one], -1  # what parts told counts once
+        same = self._hypotheses.fitted(innovation, priors, tuple(places))
+        return found if found.score > same.score + self._least_gain else None
 
     def _same(self, innovation: Innovation, answer: ScoredAnswer, begun: Priors) -> list[ScoredAnswer]:
         """As many touches, as they are and by what else the answer explains its scan with."""
@@ -79,46 +90,53 @@ class SplitMergeTest:
         may = [k for k in range(len(fit)) if self._separate or odd[k] > n.ODD_OUTLINE or not fit.shapes[k].any()]
         return sorted(may, key=lambda k: -odd[k])
 
-    def _halved(self, innovation: Innovation, begun: Priors, discs: ScoredAnswer, one: int) -> list[ScoredAnswer]:
-        """Two discs instead of one, as one beside it leads to neither. begun: the touches of those discs, outlined."""
+    def _halved(self, innovation: Innovation, discs: ScoredAnswer, begun: Priors, one: int) -> Iterator[ScoredAnswer]:
+        """Two discs instead of one, as one beside it leads to neither, then with outlines. begun: the touches of those
+        discs, outlined.
+        """
         fit = discs.fit
-        if fit is None or len(fit) >= n.MOST_TOUCHES:
-            return []
-        halves = self._halves(innovation, fit, one)
-        if not halves:
-            return []
-        as_discs, new = started(fit), (-1,) * (len(fit) + 1)
-        others = [k for k in range(len(fit)) if k != one]
+        halves = [] if fit is None or len(fit) >= n.MOST_TOUCHES else self._halves(innovation, fit, one)
+        if fit is None or not halves:
+            return
+        others, as_discs = [k for k in range(len(fit)) if k != one], started(fit)
+        association = (*(discs.association[k] for k in others), -1, -1)
         priors = [*(as_discs[k] for k in others), *map(plain, halves)]
-        found = self._hypotheses.fitted(innovation, priors, new, 2 * n.STEPS_COLD)
+        found = self._hypotheses.fitted(innovation, priors, association, 2 * n.STEPS_COLD)
+        yield found
         outlined = started(found.fit, [*(begun[k] for k in others), *halves])
-        both = found, self._hypotheses.fitted(innovation, outlined, new)
-        return [other for other in both if other.fit is not None and gaps(other.fit.states).min() > 0]
+        yield self._hypotheses.fitted(innovation, outlined, association)
 
     def _halves(self, innovation: Innovation, fit: FoundTouches, one: int) -> list[TouchPrior]:
         """The two discs beside its middle that explain most of what one does; empty where none explain more than it."""
         white, response = innovation.white, self._hypotheses.response
-        each = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) for s in fit.states]
+        counts = [innovation.live & (innovation.times_s >= prior.since_s) for prior in fit.priors]
+        each = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) * c for s, c in zip(fit.states, counts, strict=True)]
         target = white(np.where(innovation.live, np.expm1(innovation.y) - sum(each) + each[one], 0.0))
-        halves, least = list[TouchPrior](), np.inf
+        least = np.inf
         if not self._separate:
-            least = float(np.linalg.norm(target - white(np.where(innovation.live, each[one], 0.0))))
-        for places, radius in _pairs(fit.states[one]):
-            both = np.stack([response(*place, radius) for place in places], axis=1)
-            actions, residual = nnls(white(np.where(innovation.live[:, None], both, 0.0)), target)
-            if residual < least and actions.min() > 0:
-                least = residual
-                halves = [anywhere(*at, acts, innovation.span_s) for at, acts in zip(places, actions, strict=True)]
-        return halves
+            least = float(np.sum((target - white(np.where(innovation.live, each[one], 0.0))) ** 2))
+            least -= 0.0 if innovation.whole else 2 * n.ANOTHER
+        places, radius = _pairs(fit.states[one])
+        columns = np.stack([response(x, y, radius) for x, y in places.reshape(-1, 2)], axis=1)
+        columns = white(np.where(counts[one][:, None], columns, 0.0)).reshape(len(target), -1, 2)
+        normal, along = np.einsum("kni,knj->nij", columns, columns), np.einsum("kni,k->ni", columns, target)
+        actions = (np.linalg.pinv(normal, hermitian=True) @ along[:, :, None])[:, :, 0]  # (n, 2)
+        left = target @ target - np.sum(actions * along, axis=1)
+        left[actions.min(axis=1) <= 0] = np.inf
+        best = int(left.argmin())
+        if left[best] >= least:
+            return []
+        two = zip(places[best], actions[best], strict=True)
+        since_s, span_s = fit.priors[one].since_s, innovation.span_s
+        return [replace(anywhere(x, y, action, span_s), since_s=since_s) for (x, y), action in two]
 
 
-def _pairs(state: Array) -> Iterator[tuple[list[tuple[float, float]], float]]:
-    """Places of two discs on either side of the middle of one (7,), and log radius of each: both have its area."""
-    (x, y), radius = state[PLACE], float(np.exp(state[LOG_RADIUS]))
-    small = float(state[LOG_RADIUS]) - 0.5 * np.log(2.0)
-    for angle, apart in product(HALVED_ANGLES, HALVED_APART):
-        way = apart * radius * np.array([np.cos(angle), np.sin(angle)])
-        yield [(x + side * way[0], y + side * way[1]) for side in (-1, 1)], small
+def _pairs(state: Array) -> tuple[Array, float]:
+    """(n, 2, 2) places of two discs on either side of the middle of one (7,), and log radius: both have its area."""
+    radius, small = float(np.exp(state[LOG_RADIUS])), float(state[LOG_RADIUS]) - 0.5 * np.log(2.0)
+    angles, apart = np.meshgrid(HALVED_ANGLES, HALVED_APART, indexing="ij")
+    way = (radius * apart[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)).reshape(-1, 1, 2)
+    return state[PLACE] + way * np.array([[-1.0], [1.0]]), small
 
 
 def _others(fit: FoundTouches | None, than: FoundTouches) -> bool:
