@@ -65,7 +65,7 @@ class Estimator:
 
     def use(self, tables: SkinTables) -> None:
         """Of the same skin from the next scan on, as a calibration of its mounting knows it; while nothing touches."""
-        self._tables = tables
+        self._tables, self.taring.now.pressed = tables, None
         self.taring.use(tables)
         if self.skin is not None:
             self.skin = self.skin.with_tables(tables)
@@ -84,7 +84,7 @@ class Estimator:
 
     def trust(self, baseline: KnownBaseline | None) -> None:
         """What the first scans are held against, too old to go on from; None: their bundle alone."""
-        self.now.trusted = baseline
+        self.now.trusted, self.taring.now.pressed = baseline, None
 
     def _new_skin(self, baseline: KnownBaseline) -> TaredSkin:
         """On another baseline: its touches count on."""

@@ -21,7 +21,7 @@ from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VELOCITY
 from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice, wires
-from services.estimation.faults.contact_state import ContactState
+from services.estimation.faults.contact_state import JUMP, ContactState
 from services.estimation.faults.impedance import MOST_LOG, Change, ContactColumns, Unexplained, gain_change, gain_onset
 from services.estimation.faults.wires import BoardScan, WireFault, WireKind, WireMaps, WireTable
 from services.estimation.filter import Prediction
@@ -292,7 +292,7 @@ class BoardFaults:
             found = ask(asked)
             goes_on = not change.is_gain and change.electrode == self.now.contact and self.began_within(view)
             score = found.score + (0.0 if goes_on else change.log_prior)
-            tells = unknown if odds < 0 else unknown[:, :1]  # instead of a touch also what it does within the scan
+            tells = unknown if odds < 0 < change.size else unknown[:, :1]  # instead of a touch its course tells too
             if score >= least and self._believed(change, tells, found, score, answer):
                 best, least = (change, unknown[:, 0], asked, found), score
         if best is None:
@@ -316,7 +316,7 @@ class BoardFaults:
         if change.is_gain:
             significant = abs(float(unknown[:, 0] @ found.weighted_residual)) * n.GAIN_CHANGES >= n.GAIN_LEAST
         else:
-            significant = found.z2(unknown) > n.ACTS_Z2
+            significant = found.z2(unknown) > n.ACTS_Z2 * unknown.shape[1]
         if not significant:  # the touches of the answer explain all of it
             return False
         return found.holds or (self._tells and found.chi2 < n.MOST and score > answer.score + n.WIRE_SURE)
@@ -562,10 +562,10 @@ class BoardFaults:
         self._noise.now.jumps[self.now.contact] = doubt.jumps**2
 
     def _come_back(self, home: float) -> None:
-        """A contact is well again by itself. It jumps, where that was by no more than the scans of a baseline may."""
-        size = max((each.size for each in self.now.doubt.sizes), default=0.0)
-        if size < n.TARE_JUMPS:
-            self._note_jump(size)
+        """A contact is well again by itself. It jumps, if it did so at once, and by no more than a baseline's may."""
+        sizes = [each.size - home for each in self.now.doubt.sizes] or [0.0]
+        if max(sizes) * (1 - JUMP) < sizes[0] and max(sizes) < n.TARE_JUMPS:
+            self._note_jump(max(sizes))
         self.now.size = home
         self._settle()
 

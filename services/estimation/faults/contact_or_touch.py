@@ -18,6 +18,7 @@ from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION
 from models.measurement.whitening import leave_out
 from services.estimation.faults.board import BoardFaults, BoardView, Explanation
+from services.estimation.faults.contact_state import JUMP
 from services.estimation.faults.impedance import Change, Unexplained
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import AS_IT_IS, MEMORY, Innovation, ScoredAnswer, StepBudget
@@ -26,8 +27,6 @@ from services.estimation.values import numbers as n
 Array = NDArray[np.float64]
 
 EVERY = 16  # scans from asking to asking, once those since the change have doubled so often: at 2, 4, 8, 16, 32, 48 ...
-JUMP = 0.3  # of a change that jumped: so much at most was there before, or came later; a press that takes six scans and
-# more has more of both, chosen on presses of 0.1 N on electrodes that take 1 to 20 scans
 SETTLES = 3  # whole scans in which a change may go on
 
 

@@ -108,10 +108,8 @@ class HypothesisSelection:
 
     def recounted(self, hypotheses: Hypotheses, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
         """An answer, or more touches, or fewer, with steps of its own: a bad one has spent those of the scan."""
-        if not self.measured.whole:
-            return self._begun_recounted(hypotheses, innovation, answer)
         if not self._recount_due(answer):
-            return answer
+            return self._begun_recounted(hypotheses, innovation, answer) if self.measured.scan.part else answer
         separate = self.measured.scan.separate
         own = replace(innovation, budget=StepBudget.of(1.0, separate), keeps=0.0)
         recount = SplitMergeTest(hypotheses, separate, self.skin.touches.recount_gain)
@@ -135,7 +133,7 @@ class HypothesisSelection:
         for k, (place, prior) in enumerate(zip(answer.association, answer.fit.priors, strict=True)):
             due = (place >= 0 or broad[k]) and self._grown(prior)
             if due and (found := split.of_begun(own, answer, k)) is not None:
-                return self._associated(innovation, found)
+                return self._associated(innovation, replace(found, over=answer.over + found.score - answer.score))
         return answer
 
     def _grown(self, prior: TouchPrior) -> bool:

@@ -109,7 +109,8 @@ class SplitMergeTest:
     def _halves(self, innovation: Innovation, fit: FoundTouches, one: int) -> list[TouchPrior]:
         """The two discs beside its middle that explain most of what one does; empty where none explain more than it."""
         white, response = innovation.white, self._hypotheses.response
-        counts = [innovation.live & (innovation.times_s >= prior.since_s) for prior in fit.priors]
+        live, times_s = innovation.live, innovation.times_s
+        counts = [live & (times_s >= prior.since_s) & (times_s < prior.until_s) for prior in fit.priors]
         each = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) * c for s, c in zip(fit.states, counts, strict=True)]
         target = white(np.where(innovation.live, np.expm1(innovation.y) - sum(each) + each[one], 0.0))
         least = np.inf

@@ -257,7 +257,7 @@ class Taring:
         if self.now.pressed is None:
             return False
         off = (scans.log_z0 - self.now.pressed) / scans.scatter
-        return bool((off[scans.live] ** 2).mean() < 1)
+        return bool(np.abs(off[scans.live]).max(initial=0.0) < 1)
 
     def _judged(self, scans: AgreedScans, earlier: EarlierBaseline | None) -> JudgedStart:
         variance = (scans.residuals**2).mean(axis=0) / len(scans.residuals)
