@@ -254,11 +254,9 @@ class NoiseModel:
         columns = white(self._contact)
         information = np.maximum((columns**2).sum(axis=0), n.TINY)
         moved = (weighted_residual @ self._contact / information) ** 2
-        flicker = (
-            np.minimum(moved, n.OUTLIER / information + n.OUTLIER * self.now.flicker).mean(axis=0) - 1 / information
-        )
+        moved = np.minimum(moved, n.OUTLIER / information + n.OUTLIER * self.now.flicker).mean(axis=0)
         least = np.maximum(n.FLICKER_FLOOR**2, self.now.jumps)
-        self.now.flicker = np.maximum(least, self.now.flicker + share * flicker)
+        self.now.flicker = np.maximum(least, self.now.flicker + share * (moved - 1 / information))
         excess = self._excess(weighted_residual, white.conditional_precisions()).mean(axis=0)
         jitter = self.now.jitter + share * (self._squares * excess[:, None]).sum(axis=0) / self._weight
         self.now.jitter = np.where(jitter > n.JITTER_FLOOR**2, jitter, 0.0)

@@ -65,7 +65,7 @@ class Estimator:
 
     def use(self, tables: SkinTables) -> None:
         """Of the same skin from the next scan on, as a calibration of its mounting knows it; while nothing touches."""
-        self._tables, self.taring.now.pressed = tables, None
+        self._tables = tables
         self.taring.use(tables)
         if self.skin is not None:
             self.skin = self.skin.with_tables(tables)

@@ -227,12 +227,12 @@ def test_contacts_that_jump_while_the_first_scans_come_hold_no_baseline_up(steps
 def test_a_contact_that_jumps_a_little_and_back_is_the_contacts(skin: StubSkin, electrode: int, times: float) -> None:
     """A touch too light to be seen elsewhere may look so, but none comes from one scan to the next, nor each time."""
     skin.felt(3)
-    for not_valid in (4, 1):
-        jumped = skin.felt(30, (), ((electrode, times),))
-        assert sum(not result.contact.valid for result in jumped) <= not_valid
-        assert states(jumped[3]) in ({"drifting": [electrode]}, {})
-        assert not any(present(result) for result in jumped)
-        assert all(result.contact.valid and not result.contact.contacts for result in skin.felt(20)[1:])
+    jumped = skin.felt(30, (), ((electrode, times),))
+    assert sum(not result.contact.valid for result in jumped) <= 4
+    assert states(jumped[-1]) == {"drifting": [electrode]}
+    assert not any(present(result) for result in jumped)
+    assert all(result.contact.valid and not result.contact.contacts for result in skin.felt(20)[1:])
+    assert all(result.contact.valid and not present(result) for result in skin.felt(30, (), ((electrode, times),)))
 
 
 @pytest.mark.parametrize("ramp", [1, 2, 4, 6, 9, 14])

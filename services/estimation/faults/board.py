@@ -303,10 +303,8 @@ class BoardFaults:
             self.now.doubt.beside = self._beside(change, found)
         return Explanation(view, asked, found, changed=True)
 
-    def _believed(
-        self, change: Change, unknown: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer
-    ) -> bool:
-        """Whether a change may be believed that is likely enough. unknown (K, n): columns of unit variance of what it
+    def _believed(self, change: Change, tells: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer) -> bool:
+        """Whether a change may be believed that is likely enough. tells (K, n): columns of unit variance of what it
         may be; found: the answer with it, and its score; answer: the one without.
         """
         if not self._apart(change, found):
@@ -314,9 +312,9 @@ class BoardFaults:
         if self._beside(change, found) and score < answer.score + n.FAULT_SURE:
             return False  # a touch takes the contact along: both are not likelier for being seldom touches
         if change.is_gain:
-            significant = abs(float(unknown[:, 0] @ found.weighted_residual)) * n.GAIN_CHANGES >= n.GAIN_LEAST
+            significant = abs(float(tells[:, 0] @ found.weighted_residual)) * n.GAIN_CHANGES >= n.GAIN_LEAST
         else:
-            significant = found.z2(unknown) > n.ACTS_Z2 * unknown.shape[1]
+            significant = found.z2(tells) > n.ACTS_Z2 * tells.shape[1]
         if not significant:  # the touches of the answer explain all of it
             return False
         return found.holds or (self._tells and found.chi2 < n.MOST and score > answer.score + n.WIRE_SURE)

@@ -404,9 +404,7 @@ class Hypotheses:
         """Further touches than those of an answer, one after the other: plain discs find them, their own outlines and
         evidence decide. outlined: the touches of that answer, free to be no discs; None: as it has them.
         """
-        white, y = innovation.white, innovation.y
-        any_touch = ScoredAnswer(AS_IT_IS, None, (), np.inf, np.inf, -np.inf, white, white.solve(y), y)  # is likelier
-        found, discs = list[ScoredAnswer](), before or any_touch
+        found, discs = list[ScoredAnswer](), _unsearched(innovation) if before is None else before
         priors = started(discs.fit) if outlined is None else list(outlined)
         while (new := self._next_disc(innovation, discs)) is not None:
             priors, association = [*priors, new], (*discs.association, -1)
@@ -573,6 +571,12 @@ class Hypotheses:
         residual = np.where(innovation.live, innovation.y, 0.0)[:, None] - np.log1p(np.maximum(changes, LEAST_MEAN))
         residual[~innovation.live] = 0.0
         return np.asarray(np.sum(answer.white(residual) ** 2, axis=0))
+
+
+def _unsearched(innovation: Innovation) -> ScoredAnswer:
+    """That nothing touches, not scored: any touch is likelier."""
+    white, y = innovation.white, innovation.y
+    return ScoredAnswer(AS_IT_IS, None, (), np.inf, np.inf, -np.inf, white, white.solve(y), y)
 
 
 def _turns_s(innovation: Innovation) -> float:

@@ -53,7 +53,7 @@ class SplitMergeTest:
             found += ask.merged(innovation, same[0], *pair)
         elif not any(other.explained and other.score > enough for other in found):
             for one in takewhile(lambda _: not innovation.spent, self._odd_ones(fit)):
-                found += self._halved(innovation, discs, begun, one)
+                found += self._halved(innovation, discs, one)
         if not any(other.explained for other in found):
             found += ask.search(innovation)
         others = [other for other in found if other.explained and _others(other.fit, fit)]
@@ -64,7 +64,7 @@ class SplitMergeTest:
     def of_begun(self, innovation: Innovation, answer: ScoredAnswer, one: int) -> ScoredAnswer | None:
         """Two discs instead of one of an answer's touches, which has just begun: None where they are not likelier."""
         assert answer.fit is not None
-        found = next(self._halved(innovation, answer, (), one), None)
+        found = next(self._halved(innovation, answer, one), None)  # discs alone
         if found is None or found.fit is None or not (found.explained and apart(found.fit.states, found.association)):
             return None
         priors, places = started(answer.fit), list(answer.association)
@@ -90,10 +90,8 @@ class SplitMergeTest:
         may = [k for k in range(len(fit)) if self._separate or odd[k] > n.ODD_OUTLINE or not fit.shapes[k].any()]
         return sorted(may, key=lambda k: -odd[k])
 
-    def _halved(self, innovation: Innovation, discs: ScoredAnswer, begun: Priors, one: int) -> Iterator[ScoredAnswer]:
-        """Two discs instead of one, as one beside it leads to neither, then with outlines. begun: the touches of those
-        discs, outlined.
-        """
+    def _halved(self, innovation: Innovation, discs: ScoredAnswer, one: int) -> Iterator[ScoredAnswer]:
+        """Two discs instead of one, as one beside it leads to neither; then all with their outlines."""
         fit = discs.fit
         halves = [] if fit is None or len(fit) >= n.MOST_TOUCHES else self._halves(innovation, fit, one)
         if fit is None or not halves:
@@ -103,6 +101,7 @@ class SplitMergeTest:
         priors = [*(as_discs[k] for k in others), *map(plain, halves)]
         found = self._hypotheses.fitted(innovation, priors, association, 2 * n.STEPS_COLD)
         yield found
+        begun = begun_as(fit, innovation.span_s)
         outlined = started(found.fit, [*(begun[k] for k in others), *halves])
         yield self._hypotheses.fitted(innovation, outlined, association)
 
@@ -112,14 +111,14 @@ class SplitMergeTest:
         live, times_s = innovation.live, innovation.times_s
         counts = [live & (times_s >= prior.since_s) & (times_s < prior.until_s) for prior in fit.priors]
         each = [s[ACTION] * response(s[0], s[1], s[LOG_RADIUS]) * c for s, c in zip(fit.states, counts, strict=True)]
-        target = white(np.where(innovation.live, np.expm1(innovation.y) - sum(each) + each[one], 0.0))
+        target = white(np.where(live, np.expm1(innovation.y), 0.0) - sum(each) + each[one])
         least = np.inf
         if not self._separate:
-            least = float(np.sum((target - white(np.where(innovation.live, each[one], 0.0))) ** 2))
+            least = float(np.sum((target - white(each[one])) ** 2))
             least -= 0.0 if innovation.whole else 2 * n.ANOTHER
         places, radius = _pairs(fit.states[one])
         columns = np.stack([response(x, y, radius) for x, y in places.reshape(-1, 2)], axis=1)
-        columns = white(np.where(counts[one][:, None], columns, 0.0)).reshape(len(target), -1, 2)
+        columns = white(columns * counts[one][:, None]).reshape(len(target), -1, 2)
         normal, along = np.einsum("kni,knj->nij", columns, columns), np.einsum("kni,k->ni", columns, target)
         actions = (np.linalg.pinv(normal, hermitian=True) @ along[:, :, None])[:, :, 0]  # (n, 2)
         left = target @ target - np.sum(actions * along, axis=1)

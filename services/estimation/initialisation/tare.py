@@ -198,11 +198,12 @@ class Taring:
 
     def __init__(self, tables: SkinTables, needed: int = int(n.TARE_SCANS)) -> None:
         """needed: scans of a baseline."""
-        self.use(tables)
         self.latest, self.now = LatestScans(needed), TaringState()
+        self.use(tables)
 
     def use(self, tables: SkinTables) -> None:
-        """Of the same skin, known better."""
+        """Of the same skin, known better: what its scans were judged by is another one."""
+        self.now.pressed = None
         self._tables, self._start, self._wires = tables, TouchAtStartTest(tables), WiringTest(tables)
 
     def offer(self, scan: Scan, live: NDArray[np.bool_], middle_s: float) -> None:
@@ -242,22 +243,21 @@ class Taring:
         except NoBaseline as why:
             self.now.problem = f"no baseline yet: {why}"
             return None
-        start = None if self._still_pressed(scans) else self._judged(scans, earlier)
-        if start is not None:
+        if not self._still_pressed(scans):
+            start = self._judged(scans, earlier)
             self.now.judgements, self.now.surely = (*scans.judgements, *start.judgements), start.sure
-        if start is None or start.says is StartSays.TOUCHED:
-            self.now.pressed = scans.log_z0 if start is not None else self.now.pressed
-            self.now.problem = PRESSED.format(" --force" * self.now.surely)
-            return None
-        self._taken(scans, start)
-        return scans
+            if start.says is not StartSays.TOUCHED:
+                self._taken(scans, start)
+                return scans
+            self.now.pressed = scans.log_z0
+        self.now.problem = PRESSED.format(" --force" * self.now.surely)
+        return None
 
     def _still_pressed(self, scans: AgreedScans) -> bool:
         """Whether they are those that were judged touched, within one scan's noise: the same would be said again."""
         if self.now.pressed is None:
             return False
-        off = (scans.log_z0 - self.now.pressed) / scans.scatter
-        return bool(np.abs(off[scans.live]).max(initial=0.0) < 1)
+        return bool(np.abs((scans.log_z0 - self.now.pressed) / scans.scatter)[scans.live].max(initial=0.0) < 1)
 
     def _judged(self, scans: AgreedScans, earlier: EarlierBaseline | None) -> JudgedStart:
         variance = (scans.residuals**2).mean(axis=0) / len(scans.residuals)
