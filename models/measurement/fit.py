@@ -37,7 +37,6 @@ from models.measurement.whitening import Whitening, diagonal_of, factor
 Array = NDArray[np.float64]
 
 LEAST_MEAN = -0.9  # relative change: nothing takes all of an impedance away
-SIZE_SAME = 1.1  # times the squared change for which evidence holds
 SIZE_CHANGED = 2.5  # times the squared change, or its inverse, beyond which its misfit is taken anew
 MOST_DAMPING = 1e4
 
@@ -49,9 +48,9 @@ class KnownWhitening:
     white: Whitening
     size2: float
 
-    def fits(self, size2: float, times: float) -> bool:
-        """Whether it does for touches of another squared change: one that differs by less than so many times."""
-        return 1 / times < size2 / self.size2 < times
+    def fits(self, size2: float) -> bool:
+        """Whether the misfit of touches of another squared change is nearly the same."""
+        return 1 / SIZE_CHANGED < size2 / self.size2 < SIZE_CHANGED
 
 
 @dataclass(frozen=True)
@@ -177,14 +176,13 @@ class TouchFitter:
         self._whiten(states, columns)
         states, columns = self._first_actions(states, columns)
         point = self._descend(self._linearised(states, rest, columns), most_steps)
-        changed, moved = not self._known.fits(_size2(point.columns), SIZE_CHANGED), self._moved(point.states)
+        changed, moved = not self._known.fits(_size2(point.columns)), self._moved(point.states)
         rest = self._turn(point.states, point.rest) if moved else point.rest
         if changed:
             self._whiten(point.states, point.columns)
         if moved or changed:
             point = self._descend(self._linearised(point.states, rest, self._columns(point.states, rest)), most_steps)
-        if self._known is not self._scene.known and not self._known.fits(_size2(point.columns), SIZE_SAME):
-            # The misfit of a stronger or weaker touch shifts the evidence by some nats.
+        if _size2(point.columns) < 1 / SIZE_CHANGED * self._known.size2:  # larger touches' misfit explains anything
             self._whiten(point.states, point.columns)
             point = self._linearised(point.states, point.rest, point.columns)
         return self._posterior(point)
@@ -232,9 +230,9 @@ class TouchFitter:
             tried = self._stepped(point, step)
             gained = point.objective - tried.objective
             if gained > 0:
-                point, damping = tried, max(damping / 3, 1e-5)
+                point, damping = tried, max(damping / 10, 1e-5)
             else:
-                damping = max(damping * 10, 1e-2)
+                damping = max(damping * 20, 1e-2)
             if abs(gained) < max(n.DONE, n.DONE_SHARE * point.objective) or damping > MOST_DAMPING:
                 break
         return point
@@ -250,7 +248,7 @@ class TouchFitter:
     def _whiten(self, states: Array, columns: TouchColumns) -> None:
         size2, scene = max(_size2(columns), n.TINY), self._scene
         known = scene.known
-        if known is not None and known.fits(size2, SIZE_CHANGED):
+        if known is not None and known.fits(size2):
             self._known = known
             return
         covariance = scene.covariance + self._misfit**2 * size2 * scene.misfit
