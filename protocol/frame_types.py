@@ -171,7 +171,7 @@ class RawFrame(Frame):
     parts: int = wire(Int(1, 10), "in how many parts the board measures a scan", 1)
     age_us: NDArray[np.float32] = wire(
         Array("<f4", ("K",), "us", or_empty=True),
-        "by how much each value is older than the end of the newest part; empty: a whole scan, in its order",
+        "by how much each value is older than the end of the newest; empty: measured in the pattern's order",
         _empty("<f4", 1),
     )
     new: NDArray[np.uint8] = wire(

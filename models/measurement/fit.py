@@ -230,9 +230,9 @@ class TouchFitter:
             tried = self._stepped(point, step)
             gained = point.objective - tried.objective
             if gained > 0:
-                point, damping = tried, max(damping / 10, 1e-5)
+                point, damping = tried, max(damping / 3, 1e-5)
             else:
-                damping = max(damping * 20, 1e-2)
+                damping = max(damping * 10, 1e-2)
             if abs(gained) < max(n.DONE, n.DONE_SHARE * point.objective) or damping > MOST_DAMPING:
                 break
         return point

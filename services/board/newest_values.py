@@ -1,4 +1,4 @@
-"""The newest value of every measurement of a scan in parts, and when each was measured."""
+"""The newest value of every measurement, and when each was measured."""
 
 from __future__ import annotations
 
@@ -27,8 +27,6 @@ class NewestValues:
         """Take a scan, or a part of one; False while not every value is of the last `parts` that the board sent: after
         a gap nothing that lies before it is handed on again. gap: something is missing just before this one.
         """
-        if scan.parts == 1:
-            return True
         follows = scan.seq == self._next_seq and not gap
         self._gap = self._gap or not (follows or self._next_seq < 0)
         self._in_a_row = self._in_a_row + 1 if follows else 1
@@ -40,14 +38,14 @@ class NewestValues:
         return self._in_a_row >= scan.parts
 
     def frame(self, header: RawFrame, scan: link.ScanFrame) -> RawFrame:
-        """The newest value of every measurement, with the header of the part taken last. A whole scan is as it is."""
-        if scan.parts == 1:
-            return header
-        new = np.zeros(len(self._order), np.uint8)
-        new[self._rows(scan)] = 1
+        """The newest value of every measurement, with the header of the part taken last, or of a whole scan."""
         age_us = (scan.device_us + scan.duration_us - self._measured_us).astype(np.float32)
-        frame = replace(header, z=self._z.copy(), status=self._status.copy(), age_us=age_us, new=new)
-        frame.part, frame.parts, frame.reasons = scan.part + 1, scan.parts, list(header.reasons)
+        frame = replace(header, z=self._z.copy(), status=self._status.copy(), age_us=age_us)
+        frame.reasons = list(header.reasons)
+        if scan.parts > 1:
+            frame.new = np.zeros(len(self._order), np.uint8)
+            frame.new[self._rows(scan)] = 1
+            frame.part, frame.parts = scan.part + 1, scan.parts
         if self._gap:
             add_reason(frame.reasons, "gap")
             self._gap = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,8 @@ from protocol.scan_setting import ScanSetting
 
 @dataclass(frozen=True)
 class Scanning:
-    """What the board is to do: measurements (K, 4) of electrodes, how each is measured, gain resistor. A scan in parts
-    has an order of the measurements (K,): part after part.
+    """What the board is to do: measurements (K, 4) of electrodes, how each is measured, gain resistor. order (K,): of
+    the measurements, part after part, so that any share of a scan sees the whole skin; None: the pattern's.
     """
 
     pattern: NDArray[np.integer]
@@ -31,8 +31,8 @@ class Scanning:
 
     @property
     def whole(self) -> Scanning:
-        """The same as whole scans, in the pattern's order."""
-        return self if self.order is None else Scanning(self.pattern, self.setting, self.rtia_ohm)
+        """The same as whole scans."""
+        return replace(self, parts=1)
 
     @property
     def config(self) -> int:

@@ -76,8 +76,7 @@ class Source(ABC):
 
 def in_parts(scanning: Scanning, bundle: Bundle, baud: int) -> Scanning:
     """The same in as many parts as the line carries; whole where it carries none."""
-    parts = parts_on_line(len(bundle.pattern), parts_of(bundle), scanning.setting, baud)
-    return replace(scanning, parts=parts, order=rolling_order(bundle)) if parts > 1 else scanning
+    return replace(scanning, parts=parts_on_line(len(bundle.pattern), parts_of(bundle), scanning.setting, baud))
 
 
 @dataclass
@@ -109,8 +108,10 @@ class BoardSource(Source):
         self.remarks = Remarks()
         self._logged: dict[str, float] = {}  # what was logged lately, and when
         self.scanning = Scanning(bundle.pattern, skin.setting, skin.rtia_ohm)
-        if skin.scan == "rolling" and tells_touches(bundle):  # a measured map gains nothing from parts
-            self.scanning = in_parts(self.scanning, bundle, skin.baud)
+        if tells_touches(bundle):  # a measured map gains nothing from when each value was measured
+            self.scanning = replace(self.scanning, order=rolling_order(bundle))
+            if skin.scan == "rolling":
+                self.scanning = in_parts(self.scanning, bundle, skin.baud)
         self.whole = False  # for now, though it could scan in parts; another thread's to say
         self.in_parts = self.scanning.parts > 1  # where the load allows it, as far as the board is known
         self._port: ports.Port | None = None
@@ -251,7 +252,7 @@ class BoardSource(Source):
         return scans[-1:]
 
     def newest(self) -> NewestValues | None:
-        """Returns what collects a new connection's values, where they come in parts."""
+        """Returns what collects a new connection's values, where they come in an order of their own."""
         return None if self.scanning.order is None else NewestValues(self.scanning.order)
 
     def handed_on(

@@ -218,7 +218,7 @@ class DelayedLine(HostTime):
             self._middles[scan.seq] = middle
         for message in self._decoder.feed(data):
             if isinstance(message, link.ScanFrame):
-                self._measured.setdefault(message.z.tobytes(), self._middles[message.seq])
+                self._measured.setdefault(np.sort(message.z).tobytes(), self._middles[message.seq])
                 self.captured.append(link.encode(message))
         if data:
             arrives = self.true_s + self._delay(self.true_s)
@@ -228,7 +228,7 @@ class DelayedLine(HostTime):
         """A frame as acquisition gave it out: when, how long ago its values were measured, and by its stamp."""
         stated_s = (self.now_ns() - frame.stamps["sample"]) * 1e-9
         usable = frame.valid and stated_s <= frame.valid_for_s  # late ones are not, to whoever hands them on
-        true_s = self.true_s - self._measured[frame.z.tobytes()]
+        true_s = self.true_s - self._measured[np.sort(frame.z).tobytes()]  # in an order of its own
         return SimpleNamespace(at_s=self.true_s, frame=frame, true_age_s=true_s, stated_age_s=stated_s, usable=usable)
 
 

@@ -217,7 +217,9 @@ class BoardFaults:
         since = at_s >= now.contact_since_s
         after, before = columns.mean(now.contact, now.size), columns.mean(now.contact, now.size_before)
         spread = columns.spread(now.contact, now.size, np.sqrt(now.variance), course)
-        return mean + np.where(since, after, before), spread * since[:, None]
+        begins = columns.begins(now.contact, now.size - now.size_before, now.contact_since_s, at_s)
+        spread = np.hstack([spread * since[:, None], np.diag(begins)[:, begins > 0]])
+        return mean + np.where(since, after, before), spread
 
     # --- wires ---
 
@@ -405,8 +407,9 @@ class BoardFaults:
         course = 2 * innovation.times_s / innovation.span_s
         y, columns = of_contacts.taken_off(innovation.y, acts, course, change)
         wider = innovation.covariance + columns @ columns.T
+        begins = of_contacts.begins(change.electrode, change.size, change.since_s, innovation.times_s)
         misfit = n.CONTACT_MISFIT * acts * of_contacts.mean(change.electrode, change.size)
-        wider[np.diag_indices_from(wider)] += misfit**2
+        wider[np.diag_indices_from(wider)] += misfit**2 + begins**2
         return replace(innovation, y=np.where(innovation.live, y, 0.0), covariance=wider), columns
 
     def _apart(self, change: Change, answer: ScoredAnswer) -> bool:

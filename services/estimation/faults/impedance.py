@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.fit import LEAST_MEAN
+from models.measurement.numbers import SUDDEN_SD
 from models.measurement.tables import SkinTables
 from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
@@ -105,6 +106,17 @@ class ContactColumns:
         shunt, settled = self.shunt[:, electrode], self.settled[electrode]
         moved = (self.series[:, electrode] + shunt * _shunt_slope(size, settled)) * sd
         return np.column_stack([moved, shunt * _shunt_sd(size, settled), moved * course])
+
+    def begins(self, electrode: int, size: float, since_s: float, times_s: Array) -> Array:
+        """(K,) standard deviation of the values about an instant since which a contact has changed: it lies between two
+        that tell of it, either of which may have seen any share. times_s (K,): on the clock of since_s.
+        """
+        mean = np.abs(self.mean(electrode, size))
+        tells = mean > 0.5 * mean.max()
+        before, after = times_s[tells & (times_s < since_s)], times_s[tells & (times_s >= since_s)]
+        if not (before.size and after.size):
+            return np.zeros(len(times_s))
+        return np.where((times_s >= before.max()) & (times_s <= after.min()), SUDDEN_SD * mean, 0.0)
 
     def taken_off(self, y: Array, acts: Array, course: Array, change: Change) -> tuple[Array, Array]:
         """log |Z| without a change, whatever touches, (K,); and (K, 3) columns of unit variance of the prior: as wide

@@ -47,9 +47,11 @@ class Scan:
         message that was skipped brought is new too.
         """
         count = len(frame.z)
-        if frame.parts > 1:
+        if len(frame.age_us):
             ages_s = frame.age_us.astype(float) * US
-            newest_s, duration_s = _spanned_s(ages_s[frame.new != 0]), _spanned_s(ages_s)
+            duration_s = newest_s = _spanned_s(ages_s)
+            if len(frame.new):
+                newest_s = _spanned_s(ages_s[frame.new != 0])
         else:
             duration_s = newest_s = _duration_s(frame, before)
             ages_s = duration_s * (1 - (np.arange(count) + 0.5) / max(count, 1))
