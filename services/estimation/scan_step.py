@@ -13,7 +13,6 @@ from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice
 from services.estimation.faults.board import Explanation
 from services.estimation.faults.isolation import FaultIsolation
-from services.estimation.filter import SkinFilter
 from services.estimation.gates import Seen
 from services.estimation.hypotheses.innovation import (
     AS_IT_IS,
@@ -126,14 +125,19 @@ class ScanStep:
 
     def _slow_onset(self) -> tuple[Innovation, ScoredAnswer] | None:
         """A touch where nothing touched, that no drift since a while ago explains: the filter is that of then."""
-        skin, measured = self.skin, self.measured
+        skin, measured, middle_s = self.skin, self.measured, self.measured.middle_s
         if len(skin.touches) or self.now.unexplained_s or not (measured.whole and skin.tables.predicted):
             return None
-        if not self._plain or (then := skin.slow_onset.due(measured.middle_s)) is None:
+        if not self._plain or (then := skin.slow_onset.due(middle_s)) is None:
             return None
-        if not skin.hypotheses.untouched(self._innovation(skin.drift)).quiet:
-            return None  # it came at once, or is none: that is asked as of any scan
-        innovation = self._innovation(then, n.SLOW_TIMES)
+        predicted = then.predict(middle_s, skin.noise.now.flicker)
+        covariance = skin.noise.covariance(measured.scan.part) + predicted.covariance
+        covariance += then.inflated_process_noise(n.SLOW_TIMES)
+        leave_out(covariance, measured.live)
+        y = skin.faults.taken_off(measured.log_z - skin.log_z0 - predicted.shift)
+        y = np.where(measured.live, y, 0.0)
+        information = skin.hypotheses.grid.information(Whitening.of(covariance))
+        innovation = Innovation(*measured.fields, y, covariance, information)
         answer = skin.hypotheses.slow_onset(innovation)
         if answer is None:
             return None
@@ -141,17 +145,6 @@ class ScanStep:
         skin.learning.doubt()
         skin.null_gate.forget()
         return innovation, answer
-
-    def _innovation(self, drift: SkinFilter, inflated: float = 0.0) -> Innovation:
-        """By what a filter predicts of the untouched skin. inflated: times its faster drift that may be beside it."""
-        skin, measured = self.skin, self.measured
-        predicted = drift.predict(measured.middle_s, skin.noise.now.flicker)
-        covariance = skin.noise.covariance(measured.scan.part) + predicted.covariance
-        covariance += drift.inflated_process_noise(inflated)
-        leave_out(covariance, measured.live)
-        y = skin.faults.taken_off(measured.log_z - skin.log_z0 - predicted.shift)
-        information = skin.hypotheses.grid.information(Whitening.of(covariance))
-        return Innovation(*measured.fields, np.where(measured.live, y, 0.0), covariance, information)
 
     def _going_on(self) -> tuple[Innovation, ScoredAnswer] | None:
         """That touches which stayed as they are do so in a further part of a scan; else None."""

@@ -75,6 +75,8 @@ def test_the_newest_values_have_their_places_their_ages_and_say_which_are_new():
     assert np.flatnonzero(frame.new).tolist() == [0, 3]
     assert frame.z.real[order].tolist() == np.repeat([5, 1, 2, 3, 4], 2).tolist()
     assert frame.age_us[[3, 0, 9, 4]] == pytest.approx([675, 225, 4675, 4225])
+    frame = newest.frame(HEADER, whole) if newest.take(whole := replace(part(6, 1, 10), z=order.astype("c8"))) else None
+    assert frame.z.real.tolist() == [*range(10)] and (-frame.age_us).argsort().tolist() == order.tolist()
 
 
 def test_after_a_gap_nothing_from_before_it_is_handed_on():

@@ -23,7 +23,6 @@ from models.measurement.touch import (
     ACTION,
     LOG_RADIUS,
     PLACE,
-    RATE,
     TouchPrior,
     acting_steadily,
     anywhere,
@@ -255,9 +254,8 @@ class Hypotheses:
     def _from_nothing(self, innovation: Innovation) -> list[ScoredAnswer]:
         """Touches where none were: first those that the scan before left open, as a search has no steps for all."""
         found, count = list[ScoredAnswer](), len(innovation.candidates)
-        for begun in (innovation.candidates, self._begun_otherwise(innovation, innovation.candidates)) if count else ():
-            if begun is not None and not _settled(innovation, found):
-                found.append(self.fitted(innovation, begun, (-1,) * count, n.STEPS_WARM))
+        if count:
+            found.append(self.fitted(innovation, innovation.candidates, (-1,) * count, n.STEPS_WARM))
         again = count > 1 and innovation.scan.separate  # a search may find fewer, and no later scan is asked
         settled = innovation.spent or (not again and _settled(innovation, found))
         return found if settled else [*found, *self.search(innovation)]
@@ -277,8 +275,6 @@ class Hypotheses:
         yield [self.untouched(innovation)]  # costs no step
         if -1 in innovation.places:
             yield self._continued(innovation, manoeuvring)
-        if (begun := self._begun_otherwise(innovation, tracked)) is not None:
-            yield [self.fitted(innovation, begun)]
         end, turn = self._changes(innovation, tracked, unchanged)
         late = end is None or end.at_s > _turns_s(innovation) + TURN_STEPS[0]
         ways = (self._released, end), (self._turned, turn)
@@ -410,7 +406,7 @@ class Hypotheses:
             priors, association = [*priors, new], (*discs.association, -1)
             # The next parts tell one outline from two discs.
             if discs.fit is None and innovation.scan.part and new.since_s > 0:
-                found += self._begun(innovation, priors, association)
+                found.append(self.fitted(innovation, priors, association))
                 if found[-1].explained:
                     break
             more = self.fitted(innovation, [*started(discs.fit), plain(new)], association)
@@ -421,12 +417,6 @@ class Hypotheses:
             if discs.explained and not innovation.whole:
                 break
         return found
-
-    def _begun(self, innovation: Innovation, priors: Priors, association: tuple[int, ...]) -> list[ScoredAnswer]:
-        """Touches that begin within a part; where they explain nothing, at other instants."""
-        first = self.fitted(innovation, priors, association)
-        begun = None if first.explained else self._begun_otherwise(innovation, started(first.fit))
-        return [first] if begun is None else [first, self.fitted(innovation, begun, association)]
 
     def _next_disc(self, innovation: Innovation, discs: ScoredAnswer) -> TouchPrior | None:
         """The likeliest one in what others leave; None where it would not be seen, or may not be looked for."""
@@ -473,29 +463,6 @@ class Hypotheses:
         association = tuple(place for k, place in enumerate(answer.association) if k != b)
         one_less = self.fitted(innovation, priors, association)
         return [one_less, *self._wide(innovation, one_less)]
-
-    def _begun_otherwise(self, innovation: Innovation, tracked: Priors) -> list[TouchPrior] | None:
-        """Those that began within these values, at the likeliest instants for any action; None where none did."""
-        first_s = -0.5 * innovation.span_s
-        young = [k for k, prior in enumerate(tracked) if prior.since_s > first_s and prior.until_s == np.inf]
-        if not young:
-            return None
-        course = TouchCourse(self.response, innovation.times_s, innovation.span_s)
-        priors, instants = list(tracked), innovation.instants
-        for k in young:
-            lasting = replace(priors[k], since_s=-np.inf)
-            steady = lasting.start.copy()
-            steady[ACTION], steady[RATE:] = LEAST_ACTION, 0.0  # of any size: as slopes have it the middle may be none
-            others = [prior for other, prior in enumerate(priors) if other != k]
-            beside = course.columns(np.stack([prior.start for prior in others]), others).mean if others else 0.0
-            own = course.columns(steady[None], [lasting]).mean
-            columns = own[:, None] * (innovation.times_s[:, None] >= instants)
-            seen = innovation.white(np.where(innovation.live, np.expm1(innovation.y) - beside, 0.0))
-            whitened = innovation.white(columns)
-            along = np.maximum(whitened.T @ seen, 0.0)
-            at = int((along**2 / np.maximum(np.sum(whitened**2, axis=0), n.TINY)).argmax())
-            priors[k] = replace(priors[k], since_s=float(instants[at]))
-        return priors
 
     def _turned(self, innovation: Innovation, tracked: Priors, turn: StrengthStep | None) -> list[ScoredAnswer]:
         """Strengths changed at once: some in mid-scan, or any at its end, as they go or are pressed harder."""

@@ -31,7 +31,7 @@ class SplitMergeTest:
     """The evidence of more touches, or of fewer, than an answer has. Of one skin, seen as its hypotheses see it."""
 
     def __init__(self, hypotheses: Hypotheses, separate: bool, least_gain: float) -> None:
-        """separate: of scans that stand by themselves: evidence alone decides, and no later one is asked again. Of
+        """separate: of scans that stand by themselves: evidence alone decides, as no later one is asked again. Of
         others least_gain [nat] decides.
         """
         self._separate, self._least_gain = separate, 0.0 if separate else least_gain
@@ -46,7 +46,8 @@ class SplitMergeTest:
         begun = begun_as(fit, innovation.span_s)
         same = self._same(innovation, answer, begun)
         discs = ask.fitted(innovation, [plain(prior) for prior in begun], new)
-        enough = max(each.score for each in (*same, discs)) + self._least_gain
+        anew = (answer,) if answer.association == new else ()  # by what was known of none of them
+        enough = max(each.score for each in (*same, discs, *anew)) + self._least_gain
         found = [discs, *ask.search(innovation, discs, begun)]
         assert same[0].fit is not None
         if (pair := neighbours(same[0].fit.states, new)) is not None:
