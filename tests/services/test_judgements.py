@@ -1,5 +1,7 @@
 """How judgements become `valid` and `reasons`, and a scan's times; the forward residual."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -217,14 +219,13 @@ def test_a_whole_scan_is_new_and_of_parts_what_the_newest_ones_brought():
     assert second.new.all() and second.part == 0 and (np.diff(second.ages_s) < 0).all()
     assert second.duration_s == pytest.approx(PERIOD_US * 1e-6, rel=1e-3)
     assert times_s(second).mean() == pytest.approx(0.0, abs=1e-5)  # `sample` is its middle
-    before = Scan.of(part(20))
-    scan = Scan.of(part(21), before)
-    assert scan.new.sum() == 12
-    assert scan.ages_s[scan.new].max() < scan.ages_s[~scan.new].min()
+    scan = Scan.of(part(21), before := Scan.of(part(20)))
+    assert scan.new.sum() == 12 and scan.ages_s[scan.new].max() < scan.ages_s[~scan.new].min()
     assert times_s(scan)[scan.new].mean() == pytest.approx(0.0, abs=1e-5)  # `sample` is the newest part's middle
     assert Scan.of(part(23), before).new.sum() == 36, "what a skipped message brought is new too"
     assert Scan.of(part(30), before).new.all()
     assert Scan.of(part(3), Scan.of(part(2000))).new.all()  # the board's clock began anew
+    assert Scan.of(replace(part(3), age_us=np.zeros(120, "f4"))).duration_s > 0, "a board may say that it took no time"
 
 
 def test_the_ellipse_of_a_place_points_as_its_covariance_says_and_one_not_explained_is_rough_in_x_and_y():

@@ -81,8 +81,7 @@ def test_the_newest_values_have_their_places_their_ages_and_say_which_are_new():
 
 def test_after_a_gap_nothing_from_before_it_is_handed_on():
     newest = NewestValues(np.arange(10))
-    taken = [newest.take(part(seq)) for seq in (0, 1, 2, 3, 4, 6, 7, 8, 9)]
-    assert taken == [False] * 4 + [True] + [False] * 4
+    assert [newest.take(part(seq)) for seq in (0, 1, 2, 3, 4, 6, 7, 8, 9)] == [False] * 4 + [True] + [False] * 4
     for seq, reasons in ((10, ["gap"]), (11, [])):
         assert newest.take(part(seq)) and newest.frame(HEADER, part(seq)).reasons == reasons
 

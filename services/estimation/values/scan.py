@@ -49,9 +49,8 @@ class Scan:
         count = len(frame.z)
         if len(frame.age_us):
             ages_s = frame.age_us.astype(float) * US
-            duration_s = newest_s = _spanned_s(ages_s)
-            if len(frame.new):
-                newest_s = _spanned_s(ages_s[frame.new != 0])
+            newest_s = _spanned_s(ages_s[frame.new != 0] if len(frame.new) else ages_s)
+            duration_s = min(max(_spanned_s(ages_s), SHORTEST_S), LONGEST_S)
         else:
             duration_s = newest_s = _duration_s(frame, before)
             ages_s = duration_s * (1 - (np.arange(count) + 0.5) / max(count, 1))
