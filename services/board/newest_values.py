@@ -40,8 +40,8 @@ class NewestValues:
     def frame(self, header: RawFrame, scan: link.ScanFrame) -> RawFrame:
         """The newest value of every measurement, with the header of the part taken last, or of a whole scan."""
         age_us = (scan.device_us + scan.duration_us - self._measured_us).astype(np.float32)
-        frame = replace(header, z=self._z.copy(), status=self._status.copy(), age_us=age_us)
-        frame.reasons = list(header.reasons)
+        reasons = list(header.reasons)
+        frame = replace(header, z=self._z.copy(), status=self._status.copy(), age_us=age_us, reasons=reasons)
         if scan.parts > 1:
             frame.new = np.zeros(len(self._order), np.uint8)
             frame.new[self._rows(scan)] = 1

@@ -107,11 +107,11 @@ class BoardSource(Source):
         self.host = host or HostTime()
         self.remarks = Remarks()
         self._logged: dict[str, float] = {}  # what was logged lately, and when
-        self.scanning = Scanning(bundle.pattern, skin.setting, skin.rtia_ohm)
-        if tells_touches(bundle):  # a measured map gains nothing from when each value was measured
-            self.scanning = replace(self.scanning, order=rolling_order(bundle))
-            if skin.scan == "rolling":
-                self.scanning = in_parts(self.scanning, bundle, skin.baud)
+        tells = tells_touches(bundle)  # a measured map gains nothing from when each value was measured
+        order = rolling_order(bundle) if tells else None
+        self.scanning = Scanning(bundle.pattern, skin.setting, skin.rtia_ohm, order=order)
+        if tells and skin.scan == "rolling":
+            self.scanning = in_parts(self.scanning, bundle, skin.baud)
         self.whole = False  # for now, though it could scan in parts; another thread's to say
         self.in_parts = self.scanning.parts > 1  # where the load allows it, as far as the board is known
         self._port: ports.Port | None = None

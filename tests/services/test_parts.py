@@ -71,11 +71,11 @@ def test_the_newest_values_have_their_places_their_ages_and_say_which_are_new():
     newest = NewestValues(order)
     assert [newest.take(part(seq, value=seq)) for seq in range(6)] == [False] * 4 + [True, True]
     frame = unpack(pack(newest.frame(HEADER, part(5, value=5))))
-    assert (frame.part, frame.parts, frame.reasons) == (1, 5, [])
-    assert np.flatnonzero(frame.new).tolist() == [0, 3]
+    assert (frame.part, frame.parts, frame.reasons) == (1, 5, []) and np.flatnonzero(frame.new).tolist() == [0, 3]
     assert frame.z.real[order].tolist() == np.repeat([5, 1, 2, 3, 4], 2).tolist()
     assert frame.age_us[[3, 0, 9, 4]] == pytest.approx([675, 225, 4675, 4225])
-    frame = newest.frame(HEADER, whole) if newest.take(whole := replace(part(6, 1, 10), z=order.astype("c8"))) else None
+    whole = replace(part(6, 1, 10), z=order.astype("c8"))
+    frame = newest.take(whole) and newest.frame(HEADER, whole)
     assert frame.z.real.tolist() == [*range(10)] and (-frame.age_us).argsort().tolist() == order.tolist()
 
 

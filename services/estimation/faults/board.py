@@ -290,13 +290,12 @@ class BoardFaults:
         odds = self._least_odds(answer) if doubted is None else n.LOG_PRIOR_TOUCH + n.LOG_PRIOR_SMALL * _small(doubted)
         best, least = None, answer.score + odds
         for k, change in enumerate(changes, 1):
-            asked, unknown = self._given(innovation.leaving(1 - k / len(changes)), columns, change)
+            asked, column = self._given(innovation.leaving(1 - k / len(changes)), columns, change)
             found = ask(asked)
             goes_on = not change.is_gain and change.electrode == self.now.contact and self.began_within(view)
             score = found.score + (0.0 if goes_on else change.log_prior)
-            tells = unknown if odds < 0 < change.size else unknown[:, :1]  # instead of a touch its course tells too
-            if score >= least and self._believed(change, tells, found, score, answer):
-                best, least = (change, unknown[:, 0], asked, found), score
+            if score >= least and self._believed(change, column, found, score, answer):
+                best, least = (change, column, asked, found), score
         if best is None:
             return None
         change, column, asked, found = best
@@ -305,19 +304,18 @@ class BoardFaults:
             self.now.doubt.beside = self._beside(change, found)
         return Explanation(view, asked, found, changed=True)
 
-    def _believed(self, change: Change, tells: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer) -> bool:
-        """Whether a change may be believed that is likely enough. tells (K, n): columns of unit variance of what it
-        may be; found: the answer with it, and its score; answer: the one without.
+    def _believed(self, change: Change, column: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer) -> bool:
+        """Whether a change may be believed that is likely enough. column (K,): of unit variance of its size; found: the
+        answer with it, and its score; answer: the one without.
         """
         if not self._apart(change, found):
             return False
         if self._beside(change, found) and score < answer.score + n.FAULT_SURE:
             return False  # a touch takes the contact along: both are not likelier for being seldom touches
-        if change.is_gain:
-            significant = abs(float(tells[:, 0] @ found.weighted_residual)) * n.GAIN_CHANGES >= n.GAIN_LEAST
-        else:
-            significant = found.z2(tells) > n.ACTS_Z2 * tells.shape[1]
-        if not significant:  # the touches of the answer explain all of it
+        sigmas = abs(float(column @ found.weighted_residual))  # of its prior
+        left = max(1 - found.information(column), 0.0)  # of the prior's variance
+        least = n.GAIN_LEAST / n.GAIN_CHANGES if change.is_gain else n.SIGMAS * left**0.5
+        if sigmas < least:  # the touches of the answer explain all of it
             return False
         return found.holds or (self._tells and found.chi2 < n.MOST and score > answer.score + n.WIRE_SURE)
 
@@ -399,18 +397,18 @@ class BoardFaults:
         return [*found, *columns.likeliest(scan)]
 
     def _given(self, innovation: Innovation, of_contacts: ContactColumns, change: Change) -> tuple[Innovation, Array]:
-        """The innovation beside a change of any size, and its columns (K, n) of unit variance, the size's own first."""
+        """The innovation beside a change of any size, and its column (K,) of unit variance."""
         acts = np.asarray(innovation.live & (innovation.times_s >= change.since_s), float)
         if change.is_gain:
             column = n.GAIN_CHANGES * acts
-            return replace(innovation, covariance=innovation.covariance + np.outer(column, column)), column[:, None]
+            return replace(innovation, covariance=innovation.covariance + np.outer(column, column)), column
         course = 2 * innovation.times_s / innovation.span_s
         y, columns = of_contacts.taken_off(innovation.y, acts, course, change)
         wider = innovation.covariance + columns @ columns.T
         begins = of_contacts.begins(change.electrode, change.size, change.since_s, innovation.times_s)
         misfit = n.CONTACT_MISFIT * acts * of_contacts.mean(change.electrode, change.size)
         wider[np.diag_indices_from(wider)] += misfit**2 + begins**2
-        return replace(innovation, y=np.where(innovation.live, y, 0.0), covariance=wider), columns
+        return replace(innovation, y=np.where(innovation.live, y, 0.0), covariance=wider), columns[:, 0]
 
     def _apart(self, change: Change, answer: ScoredAnswer) -> bool:
         """An electrode under a touch that changes is not named: what it does is the touch's. One that stood may change

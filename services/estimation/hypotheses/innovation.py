@@ -170,15 +170,6 @@ class ScoredAnswer:
         """Of what else may add to the scan by this column (K,): 1 / variance of its size."""
         return float(self.informations(column[:, None])[0])
 
-    def z2(self, columns: Array) -> float:
-        """Squared sigmas of what it takes for changes by these columns (K, n), which its covariance holds."""
-        white, seen = self.white(columns), columns.T @ self.weighted_residual
-        left = np.eye(len(seen)) - white.T @ white
-        if self.fit is not None:
-            along = self.fit.design.T @ white
-            left += along.T @ self.fit.solved @ along
-        return float(seen @ np.linalg.solve(left, seen))
-
     def informations(self, columns: Array) -> Array:
         """(n,) of each of these columns (K, n) alone."""
         if self.fit is not None:
