@@ -95,6 +95,8 @@ class TaredSkin:
         self.noise.begin(scans.residuals, scans.parts)
         self.noise.now.white = max(self.noise.now.white, scans.least_white)
         self.drift.begin(scans.at_s, (self.noise.now.flicker + n.CONTACT_START**2) / self.frames)
+        for residual in scans.residuals[-2:]:  # a contact that jumps in the next scan did not do so in these
+            self.faults.remember(residual, whole=True)
 
     def adopt(self, contact_per_s: float, age_s: float) -> None:
         """The baseline was taken age_s before the next scan, and nobody watched since. How far the skin has drifted is

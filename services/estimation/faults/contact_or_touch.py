@@ -91,7 +91,7 @@ class ContactOrTouchTest:
         sizes = [each.size for each in faults.doubt.sizes[-faults.doubt.seen :]]
         half = len(sizes) // 2
         later = float(np.mean(sizes[half:]) - np.mean(sizes[:half]))
-        return max(abs(before), abs(later)) < JUMP * contact.size
+        return max(before, abs(later)) < JUMP * contact.size
 
     def _over(self, view: BoardView, answer: ScoredAnswer) -> Array:
         """(K,) log |Z| over a skin with what is decided, touches that stand taken off."""
