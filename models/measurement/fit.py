@@ -163,7 +163,7 @@ class TouchFitter:
         self._mean, self._precision = np.concatenate(means), np.concatenate(sds) ** -2.0
         self._states = STATES * len(self._priors)
         self._shapes = len(self._mean) - self._states
-        known = all((prior.sd[PLACE] < n.MOST_WAY).all() for prior in self._priors)
+        known = all(prior.found or (prior.sd[PLACE] < n.MOST_WAY).all() for prior in self._priors)
         self._tells_after = 0 if known else n.TELLS_AFTER
         self.steps = 0
 

@@ -1,7 +1,7 @@
 """What touches do to the measurements: discs of conductivity drop, or what was measured on a registered skin.
 
-A disc covers pixels by its distance to their centres, linearly over one pixel's side; that adds side^2 / 12 to the
-mean square of its radius, which is taken off again.
+A disc covers each pixel by the area that they share, in closed form, and slopes are that area's derivatives: where a
+disc's pixels were covered by their distance to it alone, small discs' slopes were mostly those of the pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from models.measurement.whitening import Whitening
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-RIM = 2.0  # pixels over which slopes are taken: over one they scatter by a fifth
 CLOSE = 1e-6  # units: nearer to the centre no direction is known
 HARMONICS = range(2, 2 + len(n.HARMONIC_SDS))
 RADII = ((n.TYPICAL_RADIUS / 2, 0.1), (n.TYPICAL_RADIUS, 0.12), (0.33, 0.2))  # of discs, and between centres [unit]
@@ -29,15 +28,11 @@ INWARD = 0.9  # of its radius that a disc's centre is within the sheet's edge
 
 
 class Covered(NamedTuple):
-    """Pixels about a disc."""
+    """Pixels (n, m) about a disc."""
 
     rows: slice
     columns: slice
-    x: Array  # (n, m) from the centre
-    y: Array
-    distance: Array
-    share: Array  # covered
-    rim: Array  # share per length that the outline moves outward
+    shares: Array  # (4, n, m) covered, and its slopes to x, y and log radius
 
 
 class DiscResponse:
@@ -47,18 +42,19 @@ class DiscResponse:
         """See models/measurement/tables.py:SkinTables."""
         self._jacobian, self._along, self._turned = jacobian, along, turned
         self._pixel = 2.0 / len(jacobian)
-        self._axis: Array = np.asarray((np.arange(len(jacobian)) + 0.5) * self._pixel - 1, float)
+        self._borders: Array = np.linspace(-1.0, 1.0, len(jacobian) + 1)  # of pixels
+        self._axis: Array = self._borders[:-1] + self._pixel / 2
         self.discs = _on_the_skin(_grid_of_discs(), inside)  # (A, 3) x, y, log radius: all over the skin
 
     def __call__(self, x: float, y: float, log_radius: float) -> Array:
         """(K,)"""
         at = self._covered(x, y, log_radius)
-        return np.asarray(self._sum(self._jacobian, at, at.share[None])[0] / area_of(log_radius))
+        return np.asarray(self._sum(self._jacobian, at, at.shares[:1])[0] / area_of(log_radius))
 
     def with_slopes(self, x: float, y: float, log_radius: float) -> Array:
         """(4, K): response, and its slopes to x, y and log radius."""
         at = self._covered(x, y, log_radius)
-        found = self._sum(self._jacobian, at, self._moved(at, log_radius)) / area_of(log_radius)
+        found = self._sum(self._jacobian, at, at.shares) / area_of(log_radius)
         found[3] -= 2 * found[0]  # a larger disc of the same action is weaker
         return found
 
@@ -66,46 +62,64 @@ class DiscResponse:
         """(9, K) the touch's own directions, see models/measurement/touch.py."""
         at = self._covered(x, y, log_radius)
         found = np.empty((SHAPES, self._jacobian.shape[2]))
-        outlines = np.stack([*self._outlines(at, log_radius), self._edge(at)])
+        outlines = np.stack([*self._outlines(at, x, y), self._edge(at)])
         found[:-2] = self._sum(self._jacobian, at, outlines)
-        found[-2] = self._sum(self._along, at, at.share[None])[0]
-        found[-1] = self._sum(self._turned, at, at.share[None])[0]
+        found[-2] = self._sum(self._along, at, at.shares[:1])[0]
+        found[-1] = self._sum(self._turned, at, at.shares[:1])[0]
         return found / area_of(log_radius)
 
     def _covered(self, x: float, y: float, log_radius: float) -> Covered:
-        pixel, side = self._pixel, len(self._axis)
-        radius = np.exp(log_radius)
-        reach = radius + 2 * pixel
-        rows = slice(max(0, int((y - reach + 1) / pixel)), min(side, int((y + reach + 1) / pixel) + 1))
-        columns = slice(max(0, int((x - reach + 1) / pixel)), min(side, int((x + reach + 1) / pixel) + 1))
-        from_x: Array = self._axis[None, columns] - x
-        from_y: Array = self._axis[rows, None] - y
-        distance = np.sqrt(from_x**2 + from_y**2)
-        drawn = np.sqrt(max(radius**2 - pixel**2 / 12, (pixel / 2) ** 2))
-        inward = (drawn - distance) / pixel
-        share = np.minimum(np.maximum(inward + 0.5, 0.0), 1.0)
-        rim = (np.abs(inward) < RIM / 2) / (RIM * pixel)
-        return Covered(rows, columns, from_x, from_y, distance, share, rim)
+        radius = float(np.exp(log_radius))
+        rows, columns = self._about(y, radius), self._about(x, radius)
+        borders = self._borders
+        below = _disc_below(
+            np.minimum(np.maximum((borders[columns.start : columns.stop + 1] - x) / radius, -1.0), 1.0),
+            np.minimum(np.maximum((borders[rows.start : rows.stop + 1] - y) / radius, -1.0), 1.0),
+        )
+        left = below[:, 1:] - below[:, :-1]
+        shares = left[:, :, 1:] - left[:, :, :-1]
+        shares *= (np.array([radius, -1.0, -1.0, radius]) * radius / self._pixel**2)[:, None, None]
+        return Covered(rows, columns, shares)
 
-    def _moved(self, at: Covered, log_radius: float) -> Array:
-        outward = at.rim / np.maximum(at.distance, CLOSE)
-        return np.stack([at.share, outward * at.x, outward * at.y, at.rim * np.exp(log_radius)])
+    def _about(self, centre: float, radius: float) -> slice:
+        """The rows or columns of a disc, and one more on each side."""
+        first, last = ((centre + way + 1) / self._pixel for way in (-radius, radius))
+        begin = min(max(0, int(first) - 1), len(self._axis) - 1)  # one pixel at least, also beyond the sheet
+        return slice(begin, max(begin + 1, min(len(self._axis), int(last) + 2)))
 
-    def _outlines(self, at: Covered, log_radius: float) -> list[Array]:
+    def _outlines(self, at: Covered, x: float, y: float) -> list[Array]:
         """Outlines r (1 + h cos m phi) and r (1 + h sin m phi)."""
-        turned = (at.x + 1j * at.y) / np.maximum(at.distance, CLOSE)
-        lifted = at.rim * np.exp(log_radius)
+        from_centre = self._axis[None, at.columns] - x + 1j * (self._axis[at.rows, None] - y)
+        turned = from_centre / np.maximum(np.abs(from_centre), CLOSE)
         waves = [turned**harmonic for harmonic in HARMONICS]
-        return [lifted * part for wave in waves for part in (wave.real, wave.imag)]
+        return [at.shares[3] * part for wave in waves for part in (wave.real, wave.imag)]
 
     def _edge(self, at: Covered) -> Array:
         """A blur of variance w^2 adds w^2 / 2 times the Laplacian."""
-        return np.asarray(0.5 * (n.EDGE_WIDTH / self._pixel) ** 2 * laplace(at.share, mode="constant"))
+        return np.asarray(0.5 * (n.EDGE_WIDTH / self._pixel) ** 2 * laplace(at.shares[0], mode="constant"))
 
     def _sum(self, table: NDArray[np.float32], at: Covered, weights: Array) -> Array:
         """(c, K) of weights (c, n, m)."""
         block = table[at.rows, at.columns].reshape(-1, table.shape[2])
         return (weights.reshape(len(weights), -1).astype(np.float32) @ block).astype(float)
+
+
+def _disc_below(x: Array, y: Array) -> Array:
+    """(4, n, m) area of the unit disc that lies left of x (m,) and below y (n,), both from -1 to 1, its slopes to
+    these, and how it grows with the logarithm of the disc's radius: integrals of the chord along y, 2 (1 - x^2)^0.5, of
+    which all is below y, or none, where it is shorter than 2 |y|.
+    """
+    half_x, half_y, angle = np.sqrt(1 - x**2), np.sqrt(1 - y**2)[:, None], np.arcsin(x) + np.pi / 2
+    y, twice = y[:, None], 2.0 * (y > 0)[:, None]
+    within = np.minimum(np.maximum(x, -half_y), half_y)
+    below = np.empty((4, len(y), len(x)))
+    np.add(within, half_y, out=below[2])  # length in which y cuts the chord
+    arc = np.arcsin(within) + np.arcsin(half_y)
+    half = 0.5 * (within * np.sqrt(1 - within**2) + half_y * np.abs(y) + arc)
+    below[0] = y * below[2] + half + twice * (0.5 * (x * half_x + angle) - half)
+    below[1] = np.minimum(np.maximum(y, -half_x), half_x) + half_x
+    below[3] = arc + twice * (angle - arc)
+    return below
 
 
 def _grid_of_discs() -> Array:

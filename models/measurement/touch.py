@@ -48,6 +48,7 @@ class TouchPrior:
     until_s: float = np.inf
     turns_s: float = np.inf
     grows: bool = False
+    found: bool = False  # by a fit: the search begins where that ended
 
 
 def anywhere(x: float, y: float, action: float, span_s: float) -> TouchPrior:

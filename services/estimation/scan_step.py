@@ -285,7 +285,7 @@ class ScanStep:
             if skin.tables.predicted and now.unexplained_s > n.CHANGING_S:
                 scale = skin.hypotheses.process_noise_scale * n.ADRIFT
                 skin.hypotheses.process_noise_scale = min(n.MOST_ADRIFT, scale)
-        unexplained, change = (float(np.sum(answer.white(each) ** 2)) for each in (answer.residual, innovation.y))
+        unexplained, change = (float(np.sum(innovation.white(each) ** 2)) for each in (answer.residual, innovation.y))
         if not answer.nearly_holds and unexplained > n.STRANGE * change:  # the likeliest touches leave most of it
             now.unexplained_s = max(now.unexplained_s, float(n.CHANGING_S))
 

@@ -103,16 +103,14 @@ def test_tables_and_grid_through_a_fault_are_those_of_the_measurements_it_mixes(
 
 
 def test_slopes_are_differences_of_responses() -> None:
-    """A disc's rim runs through pixels, so that both scatter by a tenth of themselves."""
-    response, step, found = tables().response, 0.03, np.empty((16, 3))
-    for n, (x, y, radius) in enumerate(np.random.default_rng(0).uniform((-0.7, -0.7, 0.12), (0.7, 0.7, 0.4), (16, 3))):
-        place = np.array([x, y, np.log(radius)])
+    """Of discs from 4 mm on, moved or grown by an eighth of a pixel: a fit's steps lead where it says."""
+    response, step, least = tables().response, 0.005, (-0.9, -0.9, np.log(0.08))
+    for place in np.random.default_rng(0).uniform(least, (0.9, 0.9, np.log(0.4)), (16, 3)):
         at, *slopes = response.with_slopes(*place)
         assert at == pytest.approx(response(*place))
-        for axis, (slope, way) in enumerate(zip(slopes, step * np.eye(3), strict=True)):
+        for slope, way, size in zip(slopes, step * np.eye(3), (slopes[0], slopes[1], at), strict=True):
             error = slope - (response(*(place + way)) - response(*(place - way))) / (2 * step)
-            found[n, axis] = np.linalg.norm(error) / np.linalg.norm(slope if axis < 2 else 2 * at)
-    assert (np.median(found, axis=0) < 0.2).all()
+            assert np.linalg.norm(error) < 0.05 * np.linalg.norm(size), place
 
 
 def test_a_touchs_own_directions_are_those_of_its_outline_edge_and_tensor() -> None:

@@ -263,9 +263,7 @@ class BoardFaults:
         """Whether what explains a scan may as well be a fault."""
         if self.now.wire is not None and not self.exchanged:
             return False
-        fit, association = answer.fit, answer.association
-        new = fit is not None and any(association[k] < 0 and self._may_be_a_contact(fit, k) for k in range(len(fit)))
-        if new or not answer.holds or answer.cause != AS_IT_IS:
+        if self.may_be_contacts(answer) or not answer.holds or answer.cause != AS_IT_IS:
             return True
         common = np.ones(len(answer.weighted_residual))
         return float(answer.weighted_residual.sum()) ** 2 / answer.information(common) > n.GAIN_Z2
@@ -357,6 +355,13 @@ class BoardFaults:
     def _gaps(self, state: Array) -> Array:
         """(E,) from the edge of a touch (7,) to the middle of each electrode."""
         return np.asarray(self._distances(state) - np.exp(state[LOG_RADIUS]))
+
+    def may_be_contacts(self, answer: ScoredAnswer) -> list[int]:
+        """New touches of an answer that a changed contact impedance may look like."""
+        fit = answer.fit
+        if fit is None:
+            return []
+        return [k for k, place in enumerate(answer.association) if place < 0 and self._may_be_a_contact(fit, k)]
 
     def _may_be_a_contact(self, fit: FoundTouches, k: int) -> bool:
         """Whether a touch that was found is so near an electrode that a contact impedance may look like it."""

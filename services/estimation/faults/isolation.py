@@ -93,7 +93,7 @@ class FaultIsolation:
         def ask(other: Innovation) -> ScoredAnswer:
             # New touches were just searched for; what a fault hid of them the next scan tells, where one follows.
             if found.answer.explained and -1 in found.answer.association and not self._at.scan.separate:
-                return hypotheses.of_fewer(other, found.answer)
+                return hypotheses.of_fewer(other, found.answer, self._faults.may_be_contacts(found.answer))
             again = replace(other, candidates=likely, places=found.answer.association)
             return selection.answer(hypotheses, again)
 

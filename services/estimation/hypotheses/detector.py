@@ -9,12 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.noise import BURST_BLOCK
+from models.measurement.numbers import COURSE_S
 from models.measurement.response import DiscGrid
-from models.measurement.whitening import Whitening
+from models.measurement.touch import LOG_RADIUS, PLACE
+from models.measurement.whitening import Whitening, leave_out
 from services.estimation.hypotheses.innovation import ONSETS, Innovation, ScoredAnswer
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
+
+PAIRS = 3  # from which a third disc is looked for; with 1, one in five threes of tips is not found, with 6 as many
 
 
 class Detection(NamedTuple):
@@ -26,6 +30,52 @@ class Detection(NamedTuple):
     since_s: float  # it acts
 
 
+class DiscActions(NamedTuple):
+    """Normal equations of the actions of n discs, of which a few explain a scan."""
+
+    gram: Array  # (n, n)
+    along: Array  # (n,)
+    energy: float  # of the scan
+    apart: NDArray[np.bool_]  # (n, n) none on the other one
+
+    def solved(self, chosen: list[int], more: Array) -> Array:
+        """(t, ...) least squares of those discs to (n, ...)."""
+        return np.asarray(np.linalg.solve(self.gram[np.ix_(chosen, chosen)], more[chosen]))
+
+    def left(self, chosen: list[int]) -> float:
+        """Energy that they leave."""
+        return self.energy - float(self.along[chosen] @ self.solved(chosen, self.along))
+
+    def pairs(self) -> list[list[int]]:
+        """Pairs that leave least, the best one first, none with a disc of another one."""
+        own, along = np.diag(self.gram), self.along
+        action = own * along[:, None] - self.gram * along  # of each beside each, times the determinant
+        explains = action * along[:, None] / np.maximum(own * own[:, None] - self.gram**2, n.TINY)
+        explains = np.where(self.apart & (action > 0) & (action.T > 0), explains + explains.T, 0.0)
+        found = list[list[int]]()
+        for k in np.argsort(-explains.max(axis=1)).tolist():
+            pair = [k, int(explains[k].argmax())]
+            if explains[k].max() > 0 and not any({*pair} & {*other} for other in found):
+                found.append(pair)
+            if len(found) == PAIRS:
+                break
+        return found
+
+    def beside(self, before: list[int]) -> tuple[list[int], float]:
+        """Some discs and one more, each where it leaves least beside the others, and what they leave."""
+        chosen, left, own = [*before, -1], self.energy, np.diag(self.gram)
+        for k in [len(before), *range(len(before)), len(before)]:
+            others = chosen[:k] + chosen[k + 1 :]
+            known = self.solved(others, np.column_stack([self.along, self.gram]))
+            along = np.maximum(self.along - self.gram[:, others] @ known[:, 0], 0.0)
+            precision = np.maximum(own - np.sum(self.gram[others] * known[:, 1:], axis=0), 0.02 * own)
+            explains = np.where(self.apart[:, others].all(axis=1), along**2 / precision, 0.0)
+            if explains.max() <= 0:
+                return before, np.inf
+            chosen[k], left = int(explains.argmax()), self.left(others) - float(explains.max())
+        return chosen, left
+
+
 class TouchDetector:
     """The generalised likelihood ratio of one further disc, over all discs of a grid and instants at which it may have
     begun. wrong: share of a touch's change that its response gets wrong.
@@ -34,6 +84,11 @@ class TouchDetector:
     def __init__(self, grid: DiscGrid, wrong: float) -> None:
         self._grid, self._wrong = grid, wrong
         self._squares = grid.responses**2
+        radii = grid.discs[:, LOG_RADIUS]
+        self._small = np.flatnonzero(radii == radii.min())  # of which several tell most
+        places = grid.discs[self._small, PLACE]
+        away = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
+        self._apart = away > 2 * np.exp(radii.min()) + n.NEIGHBOURS  # (S, S)
 
     def best(self, innovation: Innovation, answer: ScoredAnswer, onsets: Sequence[float] = ()) -> Detection:
         """The disc that would explain most of what an answer leaves. onsets: shares of the scan after which it may have
@@ -55,6 +110,30 @@ class TouchDetector:
             return whole
         sharper = self._sharper(innovation, answer, max(whole, *begun))
         return sharper if sharper.z2 > whole.z2 * (1 + 2 * self._wrong) else whole
+
+    def several(self, innovation: Innovation, since_s: float) -> list[Detection]:
+        """Discs that explain a scan together, none of them on another one, all since an instant that is known roughly:
+        of more each leaves less than SEVERAL of what fewer leave. Empty where they are fewer than two.
+        """
+        covariance = innovation.covariance.copy()
+        leave_out(covariance, np.abs(innovation.times_s - since_s) > COURSE_S)
+        y = np.clip(np.where(innovation.live, innovation.y, 0.0), -1.0, 1.0)
+        weight = np.exp(-y) * (innovation.times_s >= since_s)  # slopes of the logarithm, once all is explained
+        white = Whitening.of(covariance).w
+        columns, target = (white * weight).astype(np.float32) @ self._grid.responses.T, white @ (1 - np.exp(-y))
+        energy, own = float(target @ target), np.sum(columns**2, axis=0) + n.TINY
+        one = energy - float((np.maximum(target @ columns, 0.0) ** 2 / own).max())
+        columns = columns[:, self._small].astype(float)
+        actions = DiscActions(columns.T @ columns, columns.T @ target, energy, self._apart)
+        if not (pairs := actions.pairs()):
+            return []
+        three = min((actions.beside(pair) for pair in pairs), key=lambda each: each[1])
+        found = [([-1], one), (pairs[0], actions.left(pairs[0])), three, actions.beside(three[0])]
+        chosen, _ = min(found, key=lambda each: each[1] * n.SEVERAL ** -len(each[0]))
+        if len(chosen) < 2:
+            return []
+        each = zip(self._small[chosen].tolist(), actions.solved(chosen, actions.along).tolist(), strict=True)
+        return [Detection(np.inf, disc, action, since_s) for disc, action in each]
 
     def _sharper(self, innovation: Innovation, answer: ScoredAnswer, best: Detection) -> Detection:
         """The same disc since the likeliest instant: a strong touch tells it to a measurement or two, and must."""

@@ -31,7 +31,7 @@ from models.measurement.touch import (
 from models.measurement.whitening import Whitening
 from services.estimation.faults.wires import WireFault
 from services.estimation.filter import SkinFilter
-from services.estimation.hypotheses.detector import TouchDetector, newest_z2
+from services.estimation.hypotheses.detector import Detection, TouchDetector, newest_z2
 from services.estimation.hypotheses.innovation import (
     AS_IT_IS,
     BURST,
@@ -205,12 +205,12 @@ class Hypotheses:
             return best
         return replace(best, over=best.score - max(answer.score for answer in answers if answer.fit is None))
 
-    def of_fewer(self, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
-        """The likeliest of an answer's touches: all, or without one of the new ones, or any: a fault may look so."""
+    def of_fewer(self, innovation: Innovation, answer: ScoredAnswer, doubted: Sequence[int]) -> ScoredAnswer:
+        """The likeliest of an answer's touches: all, or without a doubted one, or any new one: a fault may look so."""
         priors, places = started(answer.fit), answer.association
         new = [k for k, place in enumerate(places) if place < 0]
         found, wide = list[ScoredAnswer](), answer.wide or None
-        for without in (tuple(new), *((k,) for k in new if len(new) > 1), ()):
+        for without in (tuple(new), *((k,) for k in doubted if len(new) > 1), ()):
             stay = [k for k in range(len(priors)) if k not in without]
             association = tuple(places[k] for k in stay)
             fewer = [priors[k] for k in stay]
@@ -400,8 +400,9 @@ class Hypotheses:
         """Further touches than those of an answer, one after the other: plain discs find them, their own outlines and
         evidence decide. outlined: the touches of that answer, free to be no discs; None: as it has them.
         """
-        found, discs = list[ScoredAnswer](), _unsearched(innovation) if before is None else before
+        found, discs = list[ScoredAnswer](), innovation.nothing if before is None else before
         priors = started(discs.fit) if outlined is None else list(outlined)
+        least = 0.0 if innovation.whole else float(n.ANOTHER)
         while (new := self._next_disc(innovation, discs)) is not None:
             priors, association = [*priors, new], (*discs.association, -1)
             # The next parts tell one outline from two discs.
@@ -410,22 +411,37 @@ class Hypotheses:
                 if found[-1].explained:
                     break
             more = self.fitted(innovation, [*started(discs.fit), plain(new)], association)
-            if more.score < discs.score + (0.0 if innovation.whole else n.ANOTHER):
+            if more.score < discs.score + least:
                 break
+            if discs.fit is None:
+                priors, more = self._several(innovation, new, more)
             discs = more
             found += self._outlined(innovation, priors, discs)
-            if discs.explained and not innovation.whole:
-                break
         return found
+
+    def _several(
+        self, innovation: Innovation, one: TouchPrior, answer: ScoredAnswer
+    ) -> tuple[list[TouchPrior], ScoredAnswer]:
+        """Several discs at once, where they are likelier than the answer of one alone: that may lie between them."""
+        tells = answer.chi2 < n.MOST
+        several = [] if tells else self.detector.several(innovation, one.since_s)
+        if priors := [self._begun(innovation, each) for each in several]:
+            found = self.fitted(innovation, [plain(prior) for prior in priors], (-1,) * len(priors))
+            if found.score > answer.score:
+                return priors, found
+        return [one], answer
 
     def _next_disc(self, innovation: Innovation, discs: ScoredAnswer) -> TouchPrior | None:
         """The likeliest one in what others leave; None where it would not be seen, or may not be looked for."""
-        if discs.count >= n.MOST_TOUCHES or innovation.spent:
+        if discs.count >= n.MOST_TOUCHES or innovation.spent or (discs.explained and not innovation.whole):
             return None
         # None where all values are of one instant.
         found = self.detector.best(innovation, discs, ONSETS if np.ptp(innovation.times_s) > 0 else ())
         if found.z2 < (n.ANOTHER_Z2 if innovation.whole else n.FALSE_ALARM_Z2):
             return None
+        return self._begun(innovation, found)
+
+    def _begun(self, innovation: Innovation, found: Detection) -> TouchPrior:
         x, y = self.grid.discs[found.disc, PLACE]
         return replace(anywhere(x, y, found.action, innovation.span_s), since_s=found.since_s)
 
@@ -538,12 +554,6 @@ class Hypotheses:
         residual = np.where(innovation.live, innovation.y, 0.0)[:, None] - np.log1p(np.maximum(changes, LEAST_MEAN))
         residual[~innovation.live] = 0.0
         return np.asarray(np.sum(answer.white(residual) ** 2, axis=0))
-
-
-def _unsearched(innovation: Innovation) -> ScoredAnswer:
-    """That nothing touches, not scored: any touch is likelier."""
-    white, y = innovation.white, innovation.y
-    return ScoredAnswer(AS_IT_IS, None, (), np.inf, np.inf, -np.inf, white, white.solve(y), y)
 
 
 def _turns_s(innovation: Innovation) -> float:

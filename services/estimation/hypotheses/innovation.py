@@ -125,6 +125,11 @@ class Innovation(Observation):
     def white(self) -> Whitening:
         return Whitening.of(self.covariance)
 
+    @property
+    def nothing(self) -> ScoredAnswer:
+        """That nothing touches, not scored: any touch is likelier."""
+        return ScoredAnswer(AS_IT_IS, None, (), np.inf, np.inf, -np.inf, self.white, self.white.solve(self.y), self.y)
+
 
 @dataclass(frozen=True)
 class ScoredAnswer:
@@ -182,7 +187,7 @@ def started(fit: FoundTouches | None, priors: Priors | None = None) -> list[Touc
     if fit is None:
         return []
     priors = fit.priors if priors is None else priors
-    return [replace(prior, start=state.copy()) for prior, state in zip(priors, fit.states, strict=True)]
+    return [replace(prior, start=state.copy(), found=True) for prior, state in zip(priors, fit.states, strict=True)]
 
 
 def begun_at(state: Array, span_s: float, since_s: float = -np.inf, until_s: float = np.inf) -> TouchPrior:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anywhere, plain
+from services.estimation.hypotheses.detector import DiscActions
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import Innovation, Priors, ScoredAnswer, begun_as, likeliest, started
 from services.estimation.overlap import apart, neighbours
@@ -118,26 +119,22 @@ class SplitMergeTest:
             least = float(np.sum((target - white(each[one])) ** 2))
             least -= 0.0 if innovation.whole else 2 * n.ANOTHER
         places, radius = _pairs(fit.states[one])
-        columns = np.stack([response(x, y, radius) for x, y in places.reshape(-1, 2)], axis=1)
-        columns = white(columns * counts[one][:, None]).reshape(len(target), -1, 2)
-        normal, along = np.einsum("kni,knj->nij", columns, columns), np.einsum("kni,k->ni", columns, target)
-        actions = (np.linalg.pinv(normal, hermitian=True) @ along[:, :, None])[:, :, 0]  # (n, 2)
-        left = target @ target - np.sum(actions * along, axis=1)
-        left[actions.min(axis=1) <= 0] = np.inf
-        best = int(left.argmin())
-        if left[best] >= least:
+        columns = white(np.stack([response(x, y, radius) for x, y in places], axis=1) * counts[one][:, None])
+        opposite = np.kron(np.eye(len(places) // 2), 1 - np.eye(2)) > 0
+        discs = DiscActions(columns.T @ columns, columns.T @ target, float(target @ target), opposite)
+        if not (pairs := discs.pairs()) or discs.left(pairs[0]) >= least:
             return []
-        two = zip(places[best], actions[best], strict=True)
+        two = zip(places[pairs[0]], discs.solved(pairs[0], discs.along), strict=True)
         since_s, span_s = fit.priors[one].since_s, innovation.span_s
         return [replace(anywhere(x, y, action, span_s), since_s=since_s) for (x, y), action in two]
 
 
 def _pairs(state: Array) -> tuple[Array, float]:
-    """(n, 2, 2) places of two discs on either side of the middle of one (7,), and log radius: both have its area."""
+    """(2 n, 2) places, by twos on either side of the middle of a disc (7,), and log radius: both have its area."""
     radius, small = float(np.exp(state[LOG_RADIUS])), float(state[LOG_RADIUS]) - 0.5 * np.log(2.0)
     angles, apart = np.meshgrid(HALVED_ANGLES, HALVED_APART, indexing="ij")
     way = (radius * apart[..., None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)).reshape(-1, 1, 2)
-    return state[PLACE] + way * np.array([[-1.0], [1.0]]), small
+    return (state[PLACE] + way * np.array([[-1.0], [1.0]])).reshape(-1, 2), small
 
 
 def _others(fit: FoundTouches | None, than: FoundTouches) -> bool:

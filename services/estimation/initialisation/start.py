@@ -132,16 +132,14 @@ class StartLadder:
         covariances = [base + times**2 * form for times in LADDER]
         whites = [Whitening.of(covariance) for covariance in covariances]
         density = [white.log_likelihood(self._y) for white in whites]
-        found, touched, most = list[Rung](), -np.inf, -np.inf
+        found = list[Rung]()
         for k, times in enumerate(LADDER[: int(np.argmax(density)) + 2]):
             log_prior = cost - float(np.log(times))  # the larger, the less likely
             information = self._grid.information(whites[k])
             least = float(n.START_SEEN**2 * np.quantile(information, n.START_SEEN_SHARE))
             scene = FittedScan(self._y, covariances[k], self._course, self._misfit, int(self._live.sum()))
-            past = touched < most - n.START_PAST  # no touch is worth looking for any more
-            fit = None if past else self._touched(scene, whites[k], information)
+            fit = self._touched(scene, whites[k], information)
             touched = -np.inf if fit is None else fit.evidence + n.LOG_PRIOR_TOUCH * len(fit) + log_prior
-            most = max(most, touched)
             found.append(Rung(float(times), cost == 0, density[k] + log_prior, touched, least, fit))
         return found
 
