@@ -299,7 +299,7 @@ class BoardFaults:
         change, column, asked, found = best
         self._adopt(view, change, float(column @ found.weighted_residual), found)
         if not change.is_gain:
-            self.now.doubt.beside = self._beside(change, found)
+            self.now.doubt.beside = self._beside(change, found) or not found.holds
         return Explanation(view, asked, found, changed=True)
 
     def _believed(self, change: Change, column: Array, found: ScoredAnswer, score: float, answer: ScoredAnswer) -> bool:

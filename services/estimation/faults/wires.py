@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from models.measurement.numbers import TYPICAL_DROP
 from models.measurement.response import DiscGrid
-from models.measurement.touch import area_of
 from models.measurement.whitening import Whitening
 from services.estimation.faults.impedance import MOST_LOG
 from services.estimation.values import numbers as n
@@ -223,7 +222,7 @@ class WireGuess:
 
 def any_touches(grid: DiscGrid) -> Array:
     """(K, K) covariance of log |Z| over touches that may be anywhere."""
-    areas = np.array([area_of(log_radius) for log_radius in grid.discs[:, 2]])
+    areas = np.pi * np.exp(2 * grid.discs[:, 2])
     double = grid.responses.astype(float)  # a map's slopes make what rounding leaves 1000 times larger
     weighted = double * (TYPICAL_DROP * areas)[:, None]
     return np.asarray(weighted.T @ weighted * (n.MOST_TOUCHES / len(areas)))

@@ -103,14 +103,18 @@ class Hypotheses:
     """What may explain a scan of one skin, each fitted and scored by its log evidence and log prior."""
 
     def __init__(self, tables: SkinTables, noise: NoiseModel, drift: SkinFilter) -> None:
-        self.grid, self.response, self.detector = tables.grid, tables.response, TouchDetector(tables.grid, tables.wrong)
-        self._tables, self._noise, self._drift = tables, noise, drift
+        self._noise, self._drift = noise, drift
+        self._see(tables)
         self._slopes: Array | None = None
         self._through_wire: tuple[WireFault, Hypotheses] | None = None  # through a fault of the wires
         # Touches that nothing explains for certain must not be taken for noise.
         self._wider = WIDER if tables.predicted else (MEMORY, DRIFT, BURST)
         self.process_noise_scale = 1.0  # times the faster drift: grows while nothing explains the skin
         self.wide = False  # the tracked touches were explained by a response that is wrong by more than it should be
+
+    def _see(self, tables: SkinTables) -> None:
+        self._tables, self.grid, self.response = tables, tables.grid, tables.response
+        self.detector = TouchDetector(tables.grid, tables.wrong)
 
     def through(self, wire: WireFault | None, slopes: Array | None) -> Hypotheses:
         """The same of a skin that is seen through a fault of the wires; slopes (K, K): as that begins."""
@@ -120,9 +124,7 @@ class Hypotheses:
         if self._through_wire is not None and self._through_wire[0] == wire:
             return self._through_wire[1]
         seen = copy(self)
-        seen._tables, seen.grid = self._tables.through(slopes), self.grid.through(slopes)
-        seen.response = seen._tables.response
-        seen.detector = TouchDetector(seen.grid, seen._tables.wrong)
+        seen._see(self._tables.through(slopes))
         seen._slopes = slopes
         self._through_wire = wire, seen
         return seen
