@@ -19,7 +19,6 @@ from protocol.control import ControlClient
 from protocol.frames import ContactFrame, ReferenceFrame
 from protocol.runtime import host_id
 from protocol.sockets import AllReader, NewestReader
-from services.calibration.live import LivePresses
 from services.calibration.reference import ReferenceForce
 from tests.conftest import serving
 from tests.needs import ROOT
@@ -184,7 +183,7 @@ def test_presses_become_a_law_that_the_skin_uses(skin, workplace, monkeypatch):
     report = json.loads(ran.out)
     assert report["presses"] == 12 and report["error"]["left_out_rms"] < 0.12
     assert report["most_n"] == pytest.approx(LAW * 0.5)
-    monkeypatch.setattr(LivePresses.__init__, "__defaults__", (None, 0.2))  # s of patience
+    monkeypatch.setattr("services.calibration.live.PATIENCE_S", 0.2)
     ran = skin("calibrate", "--live", "--csv", "kept.csv", "--out", "b.json")  # nothing runs, nobody presses any more
     assert ran.code == 0 and "no image came" in ran.err and "the law is that of the 12 presses until then" in ran.err
     config = workplace / "skin.toml"

@@ -248,7 +248,7 @@ def test_nothing_is_no_change_and_neither_is_a_touch() -> None:
         assert likeliest(scan(transfer((Shape("circle", *place, 0.15, 0.2),))))[0].chi2 > 10
 
 
-@pytest.mark.parametrize("phase_s", [0.0, 0.0102, 0.0119])
+@pytest.mark.parametrize("phase_s", [0.0, *(pytest.param(s, marks=pytest.mark.release) for s in (0.0102, 0.0119))])
 def test_a_gain_that_steps_under_a_touch_in_parts_is_no_other_touch(phase_s):
     """The few values of the first part after it may be explained by any touch: of 96 N, 38 mm away. What was held so
     would be the foam's memory, and all later forces too small.

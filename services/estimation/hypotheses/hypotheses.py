@@ -19,15 +19,7 @@ from models.measurement.fit import LEAST_MEAN, FittedScan, KnownWhitening, Touch
 from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
 from models.measurement.numbers import AT_ONCE_S, LEAST_ACTION, MISFIT_WIDE
 from models.measurement.tables import SkinTables
-from models.measurement.touch import (
-    ACTION,
-    LOG_RADIUS,
-    PLACE,
-    TouchPrior,
-    acting_steadily,
-    anywhere,
-    plain,
-)
+from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, acting_steadily, anywhere, plain
 from models.measurement.whitening import Whitening
 from services.estimation.faults.wires import WireFault
 from services.estimation.filter import SkinFilter

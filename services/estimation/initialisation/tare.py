@@ -15,13 +15,7 @@ from models.measurement.numbers import LEAST_NOISE
 from models.measurement.tables import FIELD_DEGREES, SkinTables
 from models.prereconstruction import shrunk
 from services.estimation.faults.wires import WireFault, WireKind
-from services.estimation.initialisation.baseline import (
-    NoBaseline,
-    agreement,
-    identical,
-    measured,
-    untrained,
-)
+from services.estimation.initialisation.baseline import NoBaseline, agreement, identical, measured, untrained
 from services.estimation.initialisation.start import (
     EarlierBaseline,
     JudgedStart,
