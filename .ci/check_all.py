@@ -68,8 +68,7 @@ STEPS = (
     Step(
         "ros",
         "bridges/ros2 built by two distributions of ROS 2, each node heard by a stranger",
-        f"make ros-venv; make ros-venv ROS=jazzy; {ROS_NODE};"
-        f" EITSKIN_ROS_PYTHON=.venv-ros-jazzy/bin/python {ROS_NODE}",
+        f"make ros-venv; make ros-venv ROS=jazzy; {ROS_NODE}; EITSKIN_ROS_PYTHON=.venv-ros-jazzy/bin/python {ROS_NODE}",
         2400,
         ("extras",),
     ),

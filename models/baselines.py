@@ -59,11 +59,7 @@ class LinearMethod:
 
 
 def noser(
-    physics: PeerPhysics,
-    lambda_: float = PUBLISHED_LAMBDA,
-    n: int = 96,
-    units: str = "ohm",
-    power: float = NOSER_POWER,
+    physics: PeerPhysics, lambda_: float = PUBLISHED_LAMBDA, n: int = 96, units: str = "ohm", power: float = NOSER_POWER
 ) -> LinearMethod:
     """One step of Gauss-Newton with the NOSER prior, equation 1 of the paper: RM = (J^T W J + lambda^2 R)^-1 J^T W.
 

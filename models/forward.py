@@ -94,12 +94,7 @@ class ForwardModel(Elements):
     def factorise(matrix: sparse.csc_matrix) -> SuperLU:
         """Its factorisation: already in a fill-reducing order and positive definite, so no pivoting, no reordering."""
         return splu(
-            matrix,
-            permc_spec="NATURAL",
-            diag_pivot_thresh=0.0,
-            relax=1,
-            panel_size=8,
-            options={"SymmetricMode": True},
+            matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=1, panel_size=8, options={"SymmetricMode": True}
         )
 
     def _contact(self, given: ArrayLike | None) -> Array:

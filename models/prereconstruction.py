@@ -192,12 +192,7 @@ class PreReconstructor:
         return (np.abs(z) - np.abs(z0)) / self.normaliser(np.abs(z0))
 
     def condition(
-        self,
-        sigma: Array,
-        *,
-        drift: Drift | None = None,
-        weights: Array | None = None,
-        tare_frames: int = TARE_FRAMES,
+        self, sigma: Array, *, drift: Drift | None = None, weights: Array | None = None, tare_frames: int = TARE_FRAMES
     ) -> Operator:
         """Operator for noise of standard deviation sigma (K,) in d on each frame.
 

@@ -68,11 +68,7 @@ class SettingErrors:
 
 
 def errors(
-    setting: ScanSetting,
-    snr_db: float,
-    change: float,
-    wander_v: float = WANDER_V,
-    capacitor_f: float = CAPACITOR_F,
+    setting: ScanSetting, snr_db: float, change: float, wander_v: float = WANDER_V, capacitor_f: float = CAPACITOR_F
 ) -> SettingErrors:
     """snr_db: of the paper's setting, for white noise. change: mean step of |Z| from measurement to measurement,
     relative (models/scan_orders.py). The current's phase at a switch is any.

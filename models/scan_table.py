@@ -8,15 +8,7 @@ import numpy as np
 
 from models.scan_limits import INTERFERENCE, SIGNAL_V, EarlyFloor, EarlyTouch, SettingErrors, errors
 from models.scan_orders import Neighbours, by_change, by_switching
-from models.scan_response import (
-    LINE_HZ,
-    MOTOR_HZ,
-    SWITCHING_HZ,
-    decibels,
-    offset_left,
-    sine_left,
-    transient_left,
-)
+from models.scan_response import LINE_HZ, MOTOR_HZ, SWITCHING_HZ, decibels, offset_left, sine_left, transient_left
 from protocol.part_size import BAUD, frame_bytes, line_load, line_s, parts_on_line
 from protocol.scan_setting import NAMED, PAPER, ScanSetting
 

@@ -56,9 +56,7 @@ class AsyncContactSubscriber:
                 raise self._newest.stale(max_age)
         return frame
 
-    async def frames(
-        self, max_age: float | None = None, *, allow_invalid: bool = False
-    ) -> AsyncIterator[ContactFrame]:
+    async def frames(self, max_age: float | None = None, *, allow_invalid: bool = False) -> AsyncIterator[ContactFrame]:
         """`next_frame` for ever. Silence ends it with Stale, a frame that is not valid with NotValid."""
         while True:
             yield await self.next_frame(max_age, allow_invalid=allow_invalid)

@@ -361,10 +361,7 @@ class ForceFrame(Frame):
     """The total load alone: small, for fast loops."""
 
     wrench: list[float] = wire(
-        Vector(6),
-        "Fx, Fy, Fz [N], Tx, Ty, Tz [N m] on the skin, at its frame's origin",
-        lambda: [0.0] * 6,
-        always=True,
+        Vector(6), "Fx, Fy, Fz [N], Tx, Ty, Tz [N m] on the skin, at its frame's origin", lambda: [0.0] * 6, always=True
     )
     force_n: float | None = wire(Maybe(Float(unit="N")), "sum of the normal forces, or nil", None)
     force_sigma_n: float | None = wire(Maybe(Float(0, unit="N")), "its standard uncertainty, or nil", None)

@@ -207,13 +207,7 @@ class Config(Message):
 
     @classmethod
     def of(
-        cls,
-        setting: ScanSetting,
-        *,
-        config: int,
-        rtia_ohm: float,
-        scan: NDArray[np.uint8],
-        parts: int = 1,
+        cls, setting: ScanSetting, *, config: int, rtia_ohm: float, scan: NDArray[np.uint8], parts: int = 1
     ) -> Config:
         """The configuration that has each pair of `scan` measured so."""
         return cls(

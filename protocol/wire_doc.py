@@ -154,12 +154,7 @@ def link_tables() -> str:
 
 def code_tables() -> str:
     """The enumerations used in messages of the link."""
-    kinds: tuple[type[IntEnum] | type[Any], ...] = (
-        link.Capability,
-        link.NakReason,
-        link.EventCode,
-        link.SelfTestFault,
-    )
+    kinds: tuple[type[IntEnum] | type[Any], ...] = (link.Capability, link.NakReason, link.EventCode, link.SelfTestFault)
     out = []
     for kind in kinds:
         rows = ((member.value, f"`{member.name}`") for member in kind)

@@ -116,9 +116,7 @@ def lasting(frame: ContactFrame) -> list[Contact]:
     return [contact for contact in frame.contacts if contact.state != "end"]
 
 
-def what_is_wrong(
-    at_s: float, frame: ContactFrame, truth: TruePaths, clocks_s: float = GONE_S
-) -> Iterator[WrongFrame]:
+def what_is_wrong(at_s: float, frame: ContactFrame, truth: TruePaths, clocks_s: float = GONE_S) -> Iterator[WrongFrame]:
     """What a valid frame shows of what is not there, and hides of what is. It is judged by its own `sample`, with the
     whole scan about it in doubt. clocks_s: by which `sample` may be off.
     """

@@ -20,11 +20,10 @@ from tests.needs import ROOT, pytest_terminal_summary  # noqa: F401  (the last i
 from tests.waiting import end, until
 
 # The same examples every time, so that nothing fails by chance; `make search` looks for others.
-SAYS_THE_LOAD = [hypothesis.HealthCheck.too_slow]
-FIXED = {"derandomize": True, "database": None, "deadline": None, "suppress_health_check": SAYS_THE_LOAD}
-hypothesis.settings.register_profile("fixed", **FIXED)
+SLOW = [hypothesis.HealthCheck.too_slow]
+hypothesis.settings.register_profile("same", derandomize=True, database=None, deadline=None, suppress_health_check=SLOW)
 if not os.environ.get("EITSKIN_SEARCH"):
-    hypothesis.settings.load_profile("fixed")
+    hypothesis.settings.load_profile("same")
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # started in the background: programs we start would inherit that
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -38,8 +37,7 @@ class FailuresAtOnce:
 
     def pytest_runtest_logreport(self, report):
         if report.failed:
-            self._terminal.write_line("")
-            self._terminal.write_line(f"FAILED {report.nodeid}")
+            self._terminal.write_line(f"\nFAILED {report.nodeid}")
             self._terminal.write_line(str(report.longrepr)[-1500:])
 
 
@@ -49,6 +47,14 @@ def pytest_configure(config):
     terminal = config.pluginmanager.get_plugin("terminalreporter")
     if terminal is not None and not hasattr(config, "workerinput"):
         config.pluginmanager.register(FailuresAtOnce(terminal))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Of tests with many cases that take long the gate asks every third; some it leaves anyway."""
+    many = [item for item in items if item.get_closest_marker("many") and not item.get_closest_marker("release")]
+    for item in many[1::3] + many[2::3]:
+        item.add_marker("release")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -31,13 +31,7 @@ class ShownSkin:
     """One skin: what is read of it while somebody looks."""
 
     def __init__(
-        self,
-        name: str,
-        skin: BridgedSkin,
-        context: Context,
-        clock: WallClock,
-        replay: bool,
-        rate_hz: float,
+        self, name: str, skin: BridgedSkin, context: Context, clock: WallClock, replay: bool, rate_hz: float
     ) -> None:
         self.name, self._clock = name, clock
         self.channels = FoxgloveChannels(name, skin.frame_id, context)

@@ -201,11 +201,7 @@ FAILURES: tuple[tuple[tuple[int, ...], tuple[str, ...], str], ...] = (  # error 
         (),
         "{url} may not be opened: add yourself to its group (`ls -l {url}`; usually dialout) and log in again",
     ),
-    (
-        (errno.ECONNREFUSED,),
-        (),
-        "nobody listens at {url}: start the gateway there, or correct `port` in skin.toml",
-    ),
+    ((errno.ECONNREFUSED,), (), "nobody listens at {url}: start the gateway there, or correct `port` in skin.toml"),
     (
         (errno.ECONNRESET, errno.EPIPE, errno.ECONNABORTED),
         (),

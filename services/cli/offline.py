@@ -196,8 +196,7 @@ def limits(context: typer.Context) -> None:
 
 
 def bench(
-    context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Which one; its own options follow.")] = "",
+    context: typer.Context, name: Annotated[str, typer.Argument(help="Which one; its own options follow.")] = ""
 ) -> None:
     """Run a benchmark: `skin bench accuracy --help` shows its options."""
     from bench import commands

@@ -93,9 +93,7 @@ def _addresses(transport: Transport, processes: list[str]) -> str:
     return transport.data_address("publisher")
 
 
-def doctor(
-    as_json: JsonOption = False,
-) -> None:
+def doctor(as_json: JsonOption = False) -> None:
     """Say what stands in the way of contacts: configuration, bundle, port, board, clock, electrodes."""
     from services.cli.doctor import examine
 

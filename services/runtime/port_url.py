@@ -35,10 +35,7 @@ FORMS: dict[str, tuple[str, Options]] = {  # kind -> its form, and the options t
         {"n": lambda text: text.isdigit() and int(text) > 1, "skip_busy": _any},
     ),
     "spy": ("spy:///dev/ttyACM0", {"file": str.isprintable, "color": _any, "raw": _any, "all": _any}),
-    "alt": (
-        "alt:///dev/ttyACM0",
-        {"class": lambda text: text in ("Serial", "PosixPollSerial", "VTIMESerial")},
-    ),
+    "alt": ("alt:///dev/ttyACM0", {"class": lambda text: text in ("Serial", "PosixPollSerial", "VTIMESerial")}),
     "loop": ("loop://", {"logging": _level}),
     "cp2110": ("cp2110:// and the path of the USB device", {}),
 }

@@ -140,6 +140,7 @@ def test_untouched_rows_that_are_computed_or_few(noisy) -> None:
 GAINS = np.exp(0.08 * np.random.default_rng(7).standard_normal(120))
 
 
+@pytest.mark.many
 @pytest.mark.parametrize(("of", "says"), [
     (lambda z: z * GAINS, ""),  # from one pair of electrodes to the next, as converters have them
     (lambda z: 1 / z, "off what the bundle predicts"),

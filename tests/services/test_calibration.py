@@ -181,9 +181,7 @@ PRESS, OTHER = (Shape("circle", 0.4, -0.2, 0.2, 0.3),), Shape("circle", -0.5, 0.
 
 
 class Frames:
-    """Raw and image frames of the stub's skin, scan after scan, as they are asked for; `shapes` is what presses it.
-    With `late` the raw frame of a scan comes after its image.
-    """
+    """Raw and image frames of the stub's skin, scan after scan, `shapes` on it; `late`: raw ones after their images."""
 
     def __init__(self, late):
         self.stub, self.now, self.shapes = StubSkin(80.0, skin=SKIN), 0.0, ()

@@ -101,6 +101,7 @@ def test_the_lightest_press_of_the_paper_is_seen_at_the_centre(time):
     assert not any(out.touched for out in time.frames(solved(), 3.0)[1:])
 
 
+@pytest.mark.release
 def test_a_touch_held_for_ten_minutes_does_not_fade(time):
     held = solved(Touch("circle", 0.02, 0.015, 0.010, 0.3))
 
@@ -115,6 +116,7 @@ def test_a_touch_held_for_ten_minutes_does_not_fade(time):
     assert not any(out.touched for out in time.frames(solved(), 5.0)[8:])
 
 
+@pytest.mark.many
 @pytest.mark.parametrize(("radius", "drop", "left", "fades_s"), [(0.010, 0.6, 0.03, 5), (0.015, 0.4, 0.04, 20)])
 def test_a_light_press_where_a_strong_one_was_is_no_creep(time, radius, drop, left, fades_s):
     """What a strong touch leaves in the foam is no touch and fades: what comes back is a touch."""
@@ -148,6 +150,7 @@ def of(shape):
     return Touch(shape.kind, METRES * shape.x, METRES * shape.y, METRES * shape.radius, shape.drop)
 
 
+@pytest.mark.many
 @pytest.mark.parametrize(("background", "changed"), [(0.97, 0), (1.03, 0), (1.0, 3), (0.98, 16)])
 def test_rows_of_a_skin_that_drifted_since_its_untouched_ones(skin, bundle, background, changed):
     """`skin reconstruct` knows no times: three contacts of +10 %, or all of up to +-30 %, are drift, and so is 3 %."""

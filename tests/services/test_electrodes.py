@@ -8,17 +8,7 @@ import pytest
 from models.shapes import Shape
 from protocol.errors import EitskinError
 from services.pipeline import Result
-from tests.services.stub_skin import (
-    SCAN_S,
-    TARE_SCANS,
-    StubSkin,
-    lasting,
-    off_m,
-    present,
-    sheet,
-    states,
-    transfer,
-)
+from tests.services.stub_skin import SCAN_S, TARE_SCANS, StubSkin, lasting, off_m, present, sheet, states, transfer
 
 PRESS = (Shape("circle", 0.3, -0.2, 0.25, 0.3),)
 NAMED_WITHIN = 3  # frames
@@ -57,6 +47,7 @@ FAULTS: list[tuple[str, dict[str, Any], dict[str, list[int]], str, str]] = [
 ]  # fmt: skip
 
 
+@pytest.mark.many
 @pytest.mark.parametrize(("snr_db", "free"), [(80.0, 8), (80.0, 0), (60.0, 0)], ids=["free", "pressed", "60 dB"])
 @pytest.mark.parametrize(("name", "args", "expected", "reason", "text"), FAULTS)
 def test_a_fault_of_the_wires_is_named_and_makes_no_wrong_contact(name, args, expected, reason, text, snr_db, free):
@@ -119,6 +110,7 @@ def test_one_electrode_dead_two_degraded_three_invalid(skin: StubSkin) -> None:
 # contact impedances
 
 
+@pytest.mark.many
 @pytest.mark.parametrize("held", [False, True])
 @pytest.mark.parametrize(("electrode", "times"), [(12, 1.15), (9, 0.4), (0, 6.0), (9, 20.0)])
 def test_a_contact_that_changes_is_named_and_left_out_and_makes_no_touch(skin, electrode, times, held) -> None:
@@ -236,6 +228,7 @@ def test_a_contact_that_jumps_a_little_and_back_is_the_contacts(skin: StubSkin, 
     assert all(result.contact.valid and not present(result) for result in skin.felt(30, (), ((electrode, times),)))
 
 
+@pytest.mark.many
 @pytest.mark.parametrize("ramp", [1, 2, 4, 6, 9, 14])
 @pytest.mark.parametrize("touch", ON_ELECTRODES)
 def test_a_touch_right_on_an_electrode_is_no_drifting_contact(skin: StubSkin, touch: Any, ramp: int) -> None:
@@ -252,6 +245,7 @@ def test_a_touch_right_on_an_electrode_is_no_drifting_contact(skin: StubSkin, to
     assert result.contact.valid and not result.contact.contacts
 
 
+@pytest.mark.many
 @pytest.mark.parametrize(("electrode", "radius", "drop"), [(9, 0.12, 0.2), (9, 0.2, 0.1), (2, 0.16, 0.12)])
 def test_what_a_contact_that_drifted_under_a_light_touch_leaves_is_no_touch(skin, electrode, radius, drop) -> None:
     """It rises by 10 % a second while 1 N presses beside it, and on when that has gone."""
@@ -264,6 +258,7 @@ def test_what_a_contact_that_drifted_under_a_light_touch_leaves_is_no_touch(skin
     assert all(states(r) == {"drifting": [electrode]} for r in after[-20:])
 
 
+@pytest.mark.many
 @pytest.mark.parametrize("snr_db", [70.0, 110.0])
 def test_no_touch_is_named_a_fault(snr_db: float) -> None:
     """On, beside and across electrodes, and anywhere; one to three at a time, on a skin that was free."""

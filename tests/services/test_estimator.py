@@ -22,6 +22,7 @@ def test_an_untouched_skin_that_warms_stays_untouched(parts):
     assert len(frames) > 0.9 * (seconds - FREE_S) / curves.SCAN_S and shows(frames, 0)
 
 
+@pytest.mark.many
 @BOTH
 @pytest.mark.parametrize(
     ("kind", "radius", "force"), [("circle", 5e-3, 0.5), ("circle", 20e-3, 6.0), ("rectangle", 15e-3, 3.0)]
@@ -39,6 +40,7 @@ def test_a_press_is_shown_where_it_is_and_as_strong_as_it_is(parts, kind, radius
     assert np.median(away) < 3 and np.max(away) < 6
 
 
+@pytest.mark.release
 def test_a_touch_keeps_its_number_while_nothing_explains_the_scans():
     """0.09 s of an error in every measurement, beside a touch that is held: frames say `changing`, and go on."""
     steady, wrong_s = press(TOUCH), FREE_S + 0.6
@@ -90,6 +92,7 @@ FAR = pressed("circle", 0.0047, 0.0223, 8.3e-3, 2.5), pressed("circle", -0.0072,
 WEAK_LAST = pressed("triangle", -0.0032, -0.0112, 5.6e-3, 1.44), pressed("circle", -0.0364, -0.0199, 12.5e-3, 2.98)
 
 
+@pytest.mark.many
 @BOTH
 @pytest.mark.parametrize(
     ("three", "begin"),  # s: when each begins, and for how long it grows

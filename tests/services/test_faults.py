@@ -27,15 +27,14 @@ from tests.services.stub_skin import bundle_of_square16, transfer
 FAULT_S, BEGINS_S, FAILS_S = 0.3, 6.2, 5.5
 WELL = 5  # frames in a row
 IN_PARTS = "clipped", "fifo_overflow", "electrode_open", CONTACT_RISES, "mux_stuck", "sequence_gaps", "frozen"
-MARKS: dict[str, Any] = dict.fromkeys(IN_PARTS, ())
-MARKS["gain"] = pytest.mark.xfail(reason="for some parts a gain that steps within a scan is a small touch")
 SMALL_RISE = {"electrode": 12, "times": 1.75}  # a large one is a touch on its electrode in the parts before it is named
 CASES = [pytest.param(row, "full", id=f"{row.title}-full") for row in ROWS] + [
-    pytest.param(row, "rolling", id=f"{row.title}-rolling", marks=MARKS.get(row.title, pytest.mark.release))
+    pytest.param(row, "rolling", id=f"{row.title}-rolling", marks=() if row.title in IN_PARTS else pytest.mark.release)
     for row in ROWS
 ]
 
 
+@pytest.mark.many
 @pytest.mark.parametrize(("row", "scan"), CASES)
 def test_a_fault_is_named_and_wrong_nowhere_and_soon_over(row: FaultRow, scan: ScanMode) -> None:
     """Where nothing touches, and then under a touch that is held."""
@@ -248,7 +247,8 @@ def test_nothing_is_no_change_and_neither_is_a_touch() -> None:
         assert likeliest(scan(transfer((Shape("circle", *place, 0.15, 0.2),))))[0].chi2 > 10
 
 
-@pytest.mark.parametrize("phase_s", [0.0, *(pytest.param(s, marks=pytest.mark.release) for s in (0.0102, 0.0119))])
+@pytest.mark.many
+@pytest.mark.parametrize("phase_s", [0.0, 0.0102, 0.0119])
 def test_a_gain_that_steps_under_a_touch_in_parts_is_no_other_touch(phase_s):
     """The few values of the first part after it may be explained by any touch: of 96 N, 38 mm away. What was held so
     would be the foam's memory, and all later forces too small.

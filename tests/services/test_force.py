@@ -76,6 +76,7 @@ def scored(skinny: Skinny, presses: SolvedPresses, frames: int = 1) -> tuple[np.
     return np.array(z), np.array(errors)
 
 
+@pytest.mark.release
 def test_presses_of_any_shape_are_no_worse_than_they_say(presses: SolvedPresses, bundle: Bundle) -> None:
     """A sigma is of soft edges too, and these are sharp: 86 to 88 % lie within one in draws of 450."""
     for decibel, frames in ((75.0, 1), (66.0, 4)):

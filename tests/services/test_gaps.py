@@ -64,6 +64,7 @@ def after_a_gap(scan: ScanMode, how: str, seconds: float, what: str, seed: int) 
     return right(host, start)
 
 
+@pytest.mark.many
 @pytest.mark.parametrize(("how", "seconds", "what"), [
     ("lost", 0.3, "elsewhere"),
     ("hang", 0.8, "beside"),
@@ -103,6 +104,7 @@ def shows_alone(host: SimulatedHost, press: DiscPress) -> None:
     assert np.hypot(contact.position[0] - press.x, contact.position[1] - press.y) < FAR_M
 
 
+@pytest.mark.many
 @pytest.mark.parametrize("lag", [0.0, 0.02])
 @BOTH
 def test_touches_that_change_places_without_a_gap_are_not_hidden(scan: ScanMode, lag: float) -> None:
@@ -149,6 +151,7 @@ RELAYS: dict[str, Relay] = {
 }
 
 
+@pytest.mark.many
 @pytest.mark.parametrize("relay", RELAYS)
 def test_no_frame_of_a_mixture_of_parts_is_valid(relay: str) -> None:
     rng = np.random.default_rng(1)

@@ -139,6 +139,7 @@ def test_a_stream_of_garbage_leaves_nothing_behind(stages, baseline):
     assert contact.valid and off_mm(contact) < 2
 
 
+@pytest.mark.many
 @pytest.mark.parametrize("value", [np.nan, -np.inf, 0.0, 1e-41, 1e6, 1e20, 3.4e38])
 @pytest.mark.parametrize("dead", [1, 2, 3, 8, 16])
 def test_dead_electrodes_cost_accuracy_or_validity_never_truth(stages, baseline, dead, value):

@@ -163,9 +163,7 @@ def test_contacts_of_a_held_and_then_sliding_touch_come_at_the_part_rate(host):
 
 @pytest.mark.parametrize("x, y", [(0.037, -0.044), (-0.0137, 0.0436)])
 def test_a_touch_on_an_electrode_is_not_taken_for_its_contact(host, x, y):
-    """The two whole scans after its beginning are of a contact that jumped, by what they show alone. A whole scan
-    tells them apart: the first one after the beginning.
-    """
+    """By what they show alone two whole scans after its beginning are of a contact that jumped; the first tells."""
     held(host, x, y, radius=0.006)
     frames = during(host, 0.4)
     assert all(f.valid for _, f in frames) and next(t for t, f in frames if f.contacts) < SCAN_S

@@ -420,6 +420,7 @@ def any_skin(rng: np.random.Generator) -> dict[str, Array | float]:
     return {"contact": 1 + 0.3 * rng.uniform(-1, 1, 16), "background": 1 + 0.05 * rng.uniform(-1, 1)}
 
 
+@pytest.mark.many
 @pytest.mark.parametrize("touches", [
     (),
     (Shape("circle", 0.0, 0.0, 0.1, 0.1),),
@@ -440,6 +441,7 @@ def test_a_touch_at_the_start_is_told_on_any_skin(touches: tuple[Shape, ...]) ->
             assert np.hypot(*(found.fit.states[:, :2] - [touch.x, touch.y]).T).min() < 0.1  # type: ignore[union-attr]
 
 
+@pytest.mark.many
 @pytest.mark.parametrize("name", ["field10", "anisotropy5", "contacts"])
 def test_a_skin_that_is_not_as_in_its_file_is_never_said_to_be_untouched(name: str) -> None:
     """Bare or under a hand; nor is one that is bare surely touched, so that its first tare needs no force."""

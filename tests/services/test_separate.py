@@ -69,6 +69,7 @@ def test_real_presses_are_found_live_as_offline(presses, registered):
     assert agree >= 39
 
 
+@pytest.mark.release
 def test_the_order_of_the_rows_does_not_matter(presses, registered):
     """What is found in a shuffled file is what is found in the file as it was recorded, over hours of drift."""
     order, skin = np.random.default_rng(1).permutation(400) + 100, skin_of(registered)

@@ -53,6 +53,7 @@ def told(frames):
 MOMENTS = 6.1, 6.23, 6.3, 6.5, 6.72, 7.0, 7.4, 7.7, 7.92, 8.14
 
 
+@pytest.mark.many
 @pytest.mark.parametrize("scan", ["full", "rolling"])
 def test_who_loads_a_state_goes_on_as_its_own_stages_do(scan):
     """Whoever was asked for it goes on as who loads it."""

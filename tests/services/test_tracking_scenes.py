@@ -68,6 +68,7 @@ def switches(skin, scene, rng):
     return count, len(given)
 
 
+@pytest.mark.release
 def test_a_large_tip_that_presses_slowly_in_parts_is_one_contact_all_along():
     """Its first parts may be two touches; what was shown must not end while it is asked."""
     host = SimulatedHost("rolling", snr_db=80.0, seed=3)
