@@ -1,7 +1,7 @@
 """What touches do to the measurements: discs of conductivity drop, or what was measured on a registered skin.
 
-A disc covers each pixel by the area that they share, in closed form, and slopes are that area's derivatives: where a
-disc's pixels were covered by their distance to it alone, small discs' slopes were mostly those of the pixels.
+A disc covers each pixel by the area that they share, in closed form, and slopes are that area's derivatives: by its
+distance alone a small disc's slopes would mostly be those of the pixels.
 """
 
 from __future__ import annotations

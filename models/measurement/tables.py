@@ -47,7 +47,7 @@ class SkinTables:
     wrong: float = float(n.MISFIT)  # share of a touch's change that the tables get wrong
     predicted: bool = True  # whether z0 is what a model says of the untouched skin: measured bundles have none
     map: MeasuredMap | None = None  # of a registered skin
-    seen: DiscGrid | None = None  # `grid`, where it follows from that of other tables
+    known_grid: DiscGrid | None = None  # `grid`, where it follows from that of other tables
 
     @property
     def measurements(self) -> int:
@@ -72,7 +72,7 @@ class SkinTables:
     @cached_property
     def grid(self) -> DiscGrid:
         """Where something may touch."""
-        return self.seen or DiscGrid(self.response)
+        return self.known_grid or DiscGrid(self.response)
 
     def misfit_of(self, size2: float) -> Array:
         """(K, K) covariance of what the response gets wrong of touches of this squared change."""
@@ -101,7 +101,7 @@ class SkinTables:
             misfit=_of_trace_one(self.misfit * np.outer(row, row)),
             z0=z0,
             wrong=float(np.hypot(self.wrong, unlike)),
-            seen=self.grid.through(np.diag(row)),
+            known_grid=self.grid.through(np.diag(row)),
         )
 
     def through(self, slopes: Array) -> SkinTables:
@@ -115,7 +115,7 @@ class SkinTables:
             **rest,
             misfit=_of_trace_one(slopes @ self.misfit @ slopes.T),
             map=None if self.map is None else self.map.through(slopes),
-            seen=self.grid.through(slopes),
+            known_grid=self.grid.through(slopes),
         )
 
 

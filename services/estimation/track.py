@@ -301,6 +301,11 @@ def oddness(shape: Array) -> float:
     return float((shape**2 / SHAPE_SDS**2).sum())
 
 
+def may_be_several(shape: Array) -> bool:
+    """Whether an outline is that of several touches which are followed as one, or not known."""
+    return oddness(shape) > n.ODD_OUTLINE or not shape.any()
+
+
 def distance(state: Array, other: Array) -> float:
     """Of the places of two states (7,) [unit]."""
     return float(np.hypot(*(state[PLACE] - other[PLACE])))

@@ -8,8 +8,13 @@ from numpy.testing import assert_allclose
 
 from models import geometry
 from models.bundle import Bundle
-from models.calibration import CalibrationFit, TooFewMeasured, calibrated, fit
+from models.calibration import CalibrationFit, TooFewMeasured, calibrated, fields_as_mounted, fit
 from models.calibration_file import CalibrationFileError, pack, unpack
+from models.measurement.course import TouchCourse
+from models.measurement.fit import FittedScan, TouchFitter
+from models.measurement.numbers import MISFIT, MISFIT_FAR
+from models.measurement.tables import SkinTables, tables_of
+from models.measurement.touch import anywhere, plain
 from models.mismatch import Mismatch, MismatchedSheet, mounted, named
 from models.mounted import FieldModes, Mounting, Predicted, most_shift
 from models.prereconstruction import PreReconstructor
@@ -93,6 +98,30 @@ def test_calibrated_matrices_predict_the_touches_of_a_mismatched_skin(skin, bund
         off.append(np.linalg.norm(d - expected) / np.linalg.norm(d))
     assert off[1] < 0.5 * off[0] and off[1] < 0.05
     assert (made.level == matrices.level).all() and made.scale_index == matrices.scale_index
+
+
+def left_of_touches(tables: SkinTables, z0: np.ndarray) -> float:
+    """Median share of a touch's change that the best disc leaves."""
+    found, own = [], tables.relative_to(z0)
+    course = TouchCourse(own.response, np.zeros(len(z0)), 0.04)
+    for x, y in ((0.5, 0.3), (0.2, -0.7), (-0.6, -0.5)):
+        seen = np.log(measured(named("mild"), (Shape("circle", x, y, 0.2, 0.3),)) / z0)
+        scene, prior = FittedScan(seen, 1e-8 * np.eye(len(z0)), course, own.misfit, len(z0)), anywhere(x, y, 0.0, 0.04)
+        prior.sd[4:] = 1e-6
+        found.append(np.linalg.norm(TouchFitter(scene, [plain(prior)]).fit(30).left) / np.linalg.norm(seen))
+    return float(np.median(found))
+
+
+@pytest.mark.release
+def test_discs_of_a_calibrated_skin_leave_what_its_tables_say(skin, bundle: Bundle, mild: CalibrationFit) -> None:
+    z0, said = measured(named("mild")), {"bundle_hash": bundle.hash}
+    made, as_mounted = calibrated(bundle.matrices, skin, mild.mounting), mild.mounting.skin(skin).to_dict()
+    tables = tables_of(unpack(pack(made, as_mounted, said, fields_as_mounted(skin, mild.mounting)), bundle))
+    assert tables.relative_to(z0).wrong < 1.5 * MISFIT
+    left, of_the_file = (left_of_touches(each, z0) for each in (tables, tables_of(bundle)))
+    assert left < 2 * MISFIT and left < 0.3 * of_the_file
+    without_fields = tables_of(unpack(pack(made, as_mounted, said), bundle))
+    assert without_fields.wrong == MISFIT_FAR and without_fields.jacobian.shape[0] == bundle.matrices.inside.shape[0]
 
 
 def test_fields_of_another_skin_are_refused(bundle: Bundle) -> None:

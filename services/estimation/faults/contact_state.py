@@ -38,7 +38,7 @@ class ContactState:
     sizes: list[SizeAt] = field(default_factory=list)  # of the last scans
     pace: float = 0.0  # of a contact that drifts [1/s]
     drifts_until_s: float = -np.inf  # as far as is known
-    beside: bool = False  # when it changed a touch reached the electrode, or there was more: it may be a touch's
+    beside: bool = False  # a touch may be the reason: one reached the electrode, or the scan is explained roughly
     jumps: float = 0.0  # by how much it has jumped before, and no touch was seen
     unsure: float = 0.0  # by how much a scan's size may be off by its noise alone, with nothing to be seen of a touch
 

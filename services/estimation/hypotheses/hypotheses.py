@@ -96,7 +96,7 @@ class Hypotheses:
 
     def __init__(self, tables: SkinTables, noise: NoiseModel, drift: SkinFilter) -> None:
         self._noise, self._drift = noise, drift
-        self._see(tables)
+        self._set_tables(tables)
         self._slopes: Array | None = None
         self._through_wire: tuple[WireFault, Hypotheses] | None = None  # through a fault of the wires
         # Touches that nothing explains for certain must not be taken for noise.
@@ -104,7 +104,7 @@ class Hypotheses:
         self.process_noise_scale = 1.0  # times the faster drift: grows while nothing explains the skin
         self.wide = False  # the tracked touches were explained by a response that is wrong by more than it should be
 
-    def _see(self, tables: SkinTables) -> None:
+    def _set_tables(self, tables: SkinTables) -> None:
         self._tables, self.grid, self.response = tables, tables.grid, tables.response
         self.detector = TouchDetector(tables.grid, tables.wrong)
 
@@ -116,7 +116,7 @@ class Hypotheses:
         if self._through_wire is not None and self._through_wire[0] == wire:
             return self._through_wire[1]
         seen = copy(self)
-        seen._see(self._tables.through(slopes))
+        seen._set_tables(self._tables.through(slopes))
         seen._slopes = slopes
         self._through_wire = wire, seen
         return seen

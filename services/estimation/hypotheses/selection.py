@@ -25,7 +25,7 @@ from services.estimation.hypotheses.innovation import (
 )
 from services.estimation.hypotheses.split_merge import SplitMergeTest
 from services.estimation.tared import GridInformation, TaredSkin
-from services.estimation.track import oddness
+from services.estimation.track import may_be_several
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -132,7 +132,7 @@ class HypothesisSelection:
         split = SplitMergeTest(hypotheses, False, float(n.RECOUNT_GAIN))
         broad = answer.fit.states[:, LOG_RADIUS] > np.log(n.BROAD)  # not shown yet; others are, before they are asked
         for k, (place, prior) in enumerate(zip(answer.association, answer.fit.priors, strict=True)):
-            odd = broad[k] or oddness(answer.fit.shapes[k]) > n.ODD_OUTLINE or not answer.fit.shapes[k].any()
+            odd = broad[k] or may_be_several(answer.fit.shapes[k])
             due = odd and (place >= 0 or broad[k]) and self._grown(prior)
             if due and (found := split.of_begun(own, answer, k)) is not None:
                 return self._associated(innovation, replace(found, over=answer.over + found.score - answer.score))

@@ -19,7 +19,7 @@ from services.estimation.hypotheses.detector import DiscActions
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import Innovation, Priors, ScoredAnswer, begun_as, likeliest, started
 from services.estimation.overlap import apart, neighbours
-from services.estimation.track import oddness
+from services.estimation.track import may_be_several, oddness
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -88,9 +88,8 @@ class SplitMergeTest:
         """Which touches may be two discs, the oddest outline first: two that were followed as one are odd, where
         outlines are fitted.
         """
-        odd = [oddness(shape) for shape in fit.shapes]
-        may = [k for k in range(len(fit)) if self._separate or odd[k] > n.ODD_OUTLINE or not fit.shapes[k].any()]
-        return sorted(may, key=lambda k: -odd[k])
+        may = [k for k in range(len(fit)) if self._separate or may_be_several(fit.shapes[k])]
+        return sorted(may, key=lambda k: -oddness(fit.shapes[k]))
 
     def _halved(self, innovation: Innovation, discs: ScoredAnswer, one: int) -> Iterator[ScoredAnswer]:
         """Two discs instead of one, as one beside it leads to neither; then all with their outlines."""
