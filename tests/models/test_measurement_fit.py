@@ -25,23 +25,11 @@ NOISE, SPAN_S = 1e-4, 0.0437
 TIMES_S = ((np.arange(120) + 0.5) / 120 - 0.5) * SPAN_S
 
 
-def test_priors_and_limits_of_a_touch() -> None:
-    prior = anywhere(0.3, -0.2, 0.05, SPAN_S)
-    assert prior.start[[X, Y, ACTION]].tolist() == [0.3, -0.2, 0.05] and not prior.mean[[X, Y, ACTION, RATE]].any()
-    assert prior.sd[[RATE, VX]] * SPAN_S == pytest.approx([2 * 0.05, 0.04])
-    assert touches.is_anywhere(prior) and not touches.is_plain(prior) and touches.is_disc(plain(prior))
-    assert not touches.is_disc(plain(replace(prior, shape=np.ones(9)))) and prior.shape_sd is touches.SHAPE_SDS
-    steady = touches.acting_steadily(prior, 0.1, SPAN_S)
-    assert steady.start[ACTION] == steady.mean[ACTION] == 0.1 and steady.start[RATE] == 0
-    assert steady.sd[[ACTION, RATE]] == pytest.approx([0.05 * 0.1, 0.05 * 0.1 / SPAN_S])
-    assert (steady.start[PLACE] == prior.start[PLACE]).all() and prior.start[ACTION] == 0.05
-    radius = np.log(0.2)
-    assert touches.area_of(radius) == pytest.approx(np.pi * 0.04)
-    assert touches.drop_of(0.4 / 0.8 * np.pi * 0.04, radius) == pytest.approx(0.4)
+def test_states_of_a_touch_have_limits() -> None:
     state = np.array([[1.5, -2.0, np.log(0.01), 0.3, 1e9, 0.1, 0.2], [-0.5, 0.5, 3.0, 99.0, -1e9, 0.0, 0.0]])
     (x, y, small, _, rate, *_), (*_, large, most, falls, _, _) = touches.within_limits(state).tolist()
     assert (x, y) == (0.98, -0.98) and np.exp(large) == pytest.approx(0.6)
-    assert small == pytest.approx(0.5 * np.log(0.3 / np.pi / 2))  # nothing conducts there
+    assert small == pytest.approx(0.5 * np.log(0.3 / np.pi / 2)), "nothing conducts there"
     assert most == pytest.approx(2 * np.pi * 0.36) and rate == -falls == pytest.approx(most / 4e-4)
     assert (state[:, X] == [1.5, -0.5]).all()
 
@@ -198,8 +186,7 @@ def test_what_is_said_of_a_touch_that_changed_at_once_is_how_strongly_it_acts_th
 
 ELECTRODES = {"width": 5, "count": 12}
 DISC12 = {"name": "disc12", "unit": "mm", "contact_impedance": 0.01, "radius": 30, "electrodes": ELECTRODES}
-SHORT_S, ACTS = 0.03, np.pi * 0.2**2
-PLACES = (0.1, 0.05), (0.45, -0.2), (0.62, 0.3)
+SHORT_S, ACTS, PLACES = 0.03, np.pi * 0.2**2, ((0.1, 0.05), (0.45, -0.2), (0.62, 0.3))
 MOST = {  # % of the change at the places above: a touch of radius 0.2 and drop 0.4
     ("pairs", False): (0.5, 1.0, 2.0),
     ("adjacent", False): (1.2, 1.5, 2.5),
@@ -242,7 +229,7 @@ def test_a_press_is_explained_by_its_disc_and_found_where_it_is(tmp_path: Path, 
         left = np.linalg.norm(there - scale * said) / np.linalg.norm(there)
         assert scale == pytest.approx(1, abs=0.06), (x, y)
         assert 100 * left < most and left < 2 * known.wrong, (x, y, left)
-        touch = Shape("circle", x, y, 0.2, 0.2)
+        touch = replace(touch, drop=0.2)
         values = np.log1p(disc_change(pattern, touch)) + NOISE * rng.standard_normal(k)
         z2, disc, action = grid.likeliest(white.solve(values), grid.information(white))
         start = anywhere(float(grid.discs[disc, 0]), float(grid.discs[disc, 1]), action, SHORT_S)

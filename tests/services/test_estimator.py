@@ -222,11 +222,10 @@ def test_suspicious_scans_seconds_apart_are_not_in_a_row():
         host.close()
         return [(at_s(frame), frame) for _, frame in host.contacts]
 
-    samples = [t for t, _ in said_of(())]
-    scan_s, keys = float(np.median(np.diff(samples))), list[tuple[float, float]]()
-    middles = [min(samples, key=lambda t: abs(t - near)) for near in (7.0, 8.5, 10.0)]
-    for middle in middles:
-        begin, end = middle - scan_s / 2, middle + scan_s / 2 - 2e-4
+    samples, keys = np.array([t for t, _ in said_of(())]), list[tuple[float, float]]()
+    half_s, middles = np.median(np.diff(samples)) / 2, [samples[abs(samples - t).argmin()] for t in (7.0, 8.5, 10.0)]
+    for at in middles:
+        begin, end = at - half_s, at + half_s - 2e-4
         keys += [(begin - 1e-4, 1.0), (begin, 1.08), (end, 1.08), (end + 1e-4, 1.0)]
     found = said_of(((5, ramp(*keys)),))
     said = [sum("electrode_drift" in f.reasons and 0 <= t - at + 0.01 < 1.0 for t, f in found) for at in middles]
