@@ -30,7 +30,7 @@ from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Ask = Callable[[Innovation], ScoredAnswer]
+Ask = Callable[[Innovation, Change, bool], ScoredAnswer]
 
 
 @dataclass
@@ -273,7 +273,8 @@ class BoardFaults:
     ) -> Explanation | None:
         """A contact or the gain that has changed, if that is likelier than what explains a scan without. touched (K,):
         relative change by touches that stand; nearby (K, K): covariance of what they may have changed by; ask: the
-        likeliest touches of an innovation. doubted (7,): a touch that stands and lies on an electrode: without it.
+        likeliest touches beside a change, by an innovation that knows it; with all that there are only if it adds to
+        what they explain. doubted (7,): a touch that stands and lies on an electrode: without it.
         """
         view, innovation, answer = without.view, without.innovation, without.answer
         if innovation.budget.left <= 0:  # what is left open is asked again with the scans that follow
@@ -289,7 +290,7 @@ class BoardFaults:
         best, least = None, answer.score + odds
         for k, change in enumerate(changes, 1):
             asked, column = self._given(innovation.leaving(1 - k / len(changes)), columns, change)
-            found = ask(asked)
+            found = ask(asked, change, _evidence_of(column, answer) + change.log_prior > 0)
             goes_on = not change.is_gain and change.electrode == self.now.contact and self.began_within(view)
             score = found.score + (0.0 if goes_on else change.log_prior)
             if score >= least and self._believed(change, column, found, score, answer):
@@ -356,18 +357,17 @@ class BoardFaults:
         """(E,) from the edge of a touch (7,) to the middle of each electrode."""
         return np.asarray(self._distances(state) - np.exp(state[LOG_RADIUS]))
 
-    def may_be_contacts(self, answer: ScoredAnswer) -> list[int]:
-        """New touches of an answer that a changed contact impedance may look like."""
+    def may_be_contacts(self, answer: ScoredAnswer, electrodes: slice = slice(None)) -> list[int]:
+        """New touches of an answer that a changed contact impedance, of one of these, may look like."""
         fit = answer.fit
-        if fit is None:
-            return []
-        return [k for k, place in enumerate(answer.association) if place < 0 and self._may_be_a_contact(fit, k)]
+        new = [] if fit is None else [k for k, place in enumerate(answer.association) if place < 0]
+        return [k for k in new if fit is not None and self._may_be_a_contact(fit, k, electrodes)]
 
-    def _may_be_a_contact(self, fit: FoundTouches, k: int) -> bool:
-        """Whether a touch that was found is so near an electrode that a contact impedance may look like it."""
+    def _may_be_a_contact(self, fit: FoundTouches, k: int, electrodes: slice) -> bool:
+        """Whether a touch that was found is so near an electrode that its contact impedance may look like it."""
         variance = fit.covariance[STATES * k : STATES * k + 2, STATES * k : STATES * k + 2]
         unsure = n.SIGMAS * float(np.sqrt(max(np.trace(variance), 0.0)))
-        return bool(self._gaps(fit.states[k]).min() < n.ON_ELECTRODE + unsure)
+        return bool((self._gaps(fit.states[k])[electrodes] < n.ON_ELECTRODE + unsure).any())
 
     def _likeliest_changes(
         self, without: Explanation, columns: ContactColumns, touched: Array, nearby: Array
@@ -610,6 +610,13 @@ class BoardFaults:
 def _small(state: Array) -> bool:
     """Whether a touch (7,) is as small as an electrode's contact impedance may look."""
     return bool(state[LOG_RADIUS] < np.log(n.SMALL))
+
+
+def _evidence_of(column: Array, answer: ScoredAnswer) -> float:
+    """[nat] that a column (K,) of unit variance adds to what an answer explains, all else linear."""
+    information = answer.information(column)
+    along = float(column @ answer.weighted_residual)
+    return 0.5 * (along**2 / (1 + information) - float(np.log1p(information)))
 
 
 def standing_covariance(slopes: Array, states: Array) -> Array:

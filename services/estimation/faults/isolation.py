@@ -14,6 +14,7 @@ from models.measurement.fit import LEAST_MEAN
 from models.measurement.touch import TouchPrior
 from services.estimation.faults.board import BoardView, Explanation, standing_covariance
 from services.estimation.faults.contact_or_touch import ContactOrTouchTest
+from services.estimation.faults.impedance import Change
 from services.estimation.filter import Prediction
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer, begun_as
@@ -87,13 +88,14 @@ class FaultIsolation:
         self, found: Explanation, selection: HypothesisSelection, standing: Sequence[TouchPrior]
     ) -> Explanation:
         hypotheses, fit = self._through_wires(found.view), found.answer.fit
-        likely = () if fit is None else begun_as(fit, self._at.span_s)
+        likely = begun_as(fit, self._at.span_s)
         touched, nearby = self._standing_change(standing)
 
-        def ask(other: Innovation) -> ScoredAnswer:
+        def ask(other: Innovation, change: Change, adds: bool) -> ScoredAnswer:
             # New touches were just searched for; what a fault hid of them the next scan tells, where one follows.
             if found.answer.explained and -1 in found.answer.association and not self._at.scan.separate:
-                return hypotheses.of_fewer(other, found.answer, self._faults.may_be_contacts(found.answer))
+                doubted = self._faults.may_be_contacts(found.answer, slice(change.electrode, change.electrode + 1))
+                return hypotheses.of_fewer(other, found.answer, doubted, adds)
             again = replace(other, candidates=likely, places=found.answer.association)
             return selection.answer(hypotheses, again)
 
@@ -126,7 +128,7 @@ class FaultIsolation:
         del standing[k], loose[k]
         touched, nearby = self._standing_change(standing, but=k)
 
-        def ask(other: Innovation) -> ScoredAnswer:
+        def ask(other: Innovation, _change: Change, _adds: bool) -> ScoredAnswer:
             if not standing:
                 return self._skin.hypotheses.untouched(other)
             return self._skin.hypotheses.ask(replace(other, candidates=(), places=()), standing, loose)

@@ -119,7 +119,8 @@ class TouchDetector:
 
     def several(self, innovation: Innovation, since_s: float) -> list[Detection]:
         """Discs that explain a scan together, none of them on another one, all since an instant that is known roughly:
-        of more each leaves less than SEVERAL of what fewer leave. Empty where they are fewer than two.
+        of more each leaves less than SEVERAL of what fewer leave. Empty where they are fewer than two, or one leaves no
+        more than noise, or than the best disc of the grid leaves of one touch.
         """
         covariance = innovation.covariance.copy()
         leave_out(covariance, np.abs(innovation.times_s - since_s) > COURSE_S)
@@ -129,6 +130,8 @@ class TouchDetector:
         columns, target = (white * weight).astype(np.float32) @ self._grid.responses.T, white @ (1 - np.exp(-y))
         energy, own = float(target @ target), np.sum(columns**2, axis=0) + n.TINY
         one = energy - float((np.maximum(target @ columns, 0.0) ** 2 / own).max())
+        if one < max(n.GRID_MISSES * energy, n.GOOD * int(innovation.live.sum())):
+            return []
         columns = columns[:, self._small].astype(float)
         actions = DiscActions(columns.T @ columns, columns.T @ target, energy, self._apart)
         if not (pairs := actions.pairs()):

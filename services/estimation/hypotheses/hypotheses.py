@@ -35,6 +35,7 @@ from services.estimation.hypotheses.innovation import (
     Innovation,
     Priors,
     ScoredAnswer,
+    begun_as,
     likeliest,
     started,
 )
@@ -199,12 +200,14 @@ class Hypotheses:
             return best
         return replace(best, over=best.score - max(answer.score for answer in answers if answer.fit is None))
 
-    def of_fewer(self, innovation: Innovation, answer: ScoredAnswer, doubted: Sequence[int]) -> ScoredAnswer:
-        """The likeliest of an answer's touches: all, or without a doubted one, or any new one: a fault may look so."""
+    def of_fewer(
+        self, innovation: Innovation, answer: ScoredAnswer, doubted: Sequence[int], or_all: bool
+    ) -> ScoredAnswer:
+        """The likeliest of an answer's touches: without a doubted one, or any new one, or all: a fault may look so."""
         priors, places = started(answer.fit), answer.association
         new = [k for k, place in enumerate(places) if place < 0]
         found, wide = list[ScoredAnswer](), answer.wide or None
-        for without in (tuple(new), *((k,) for k in doubted if len(new) > 1), ()):
+        for without in (tuple(new), *((k,) for k in doubted if len(new) > 1), *([()] if or_all else [])):
             stay = [k for k in range(len(priors)) if k not in without]
             association = tuple(places[k] for k in stay)
             fewer = [priors[k] for k in stay]
@@ -264,11 +267,17 @@ class Hypotheses:
 
     def _of_changes(self, innovation: Innovation, tracked: Priors, manoeuvring: Priors) -> Iterator[list[ScoredAnswer]]:
         """The same touches, one way after the other: as they were, gone, begun, changed or ended at once, moved."""
+        if -1 in innovation.places:
+            yield [self._continued(innovation, manoeuvring)]
         unchanged = self.fitted(innovation, tracked, most_steps=n.STEPS_WARM)
         yield [unchanged]
         yield [self.untouched(innovation)]  # costs no step
-        if -1 in innovation.places:
-            yield self._continued(innovation, manoeuvring)
+        since_s = min(prior.since_s for prior in tracked)
+        if innovation.scan.part and since_s >= -1.5 * innovation.span_s:  # all have just begun, and may be others
+            several = self.several(innovation, since_s, max(2, len(tracked)))
+            yield [] if several is None else [several]
+        if -1 in innovation.places:  # foam remembers more of what went
+            yield self.with_cause(innovation, manoeuvring, None, MEMORY, innovation.y, n.STEPS_WARM)
         end, turn = self._changes(innovation, tracked, unchanged)
         late = end is None or end.at_s > _turns_s(innovation) + TURN_STEPS[0]
         ways = (self._released, end), (self._turned, turn)
@@ -291,8 +300,8 @@ class Hypotheses:
             found += self.with_cause(innovation, manoeuvring, None, cause, residual)
         return found
 
-    def _continued(self, innovation: Innovation, manoeuvring: Priors) -> list[ScoredAnswer]:
-        """What nearly explained the part before, a step further; or foam remembers more of what went."""
+    def _continued(self, innovation: Innovation, manoeuvring: Priors) -> ScoredAnswer:
+        """What nearly explained the part before, a step further."""
         priors, association = list(manoeuvring), list(range(len(manoeuvring)))
         for candidate, place in zip(innovation.candidates, innovation.places, strict=True):
             if place < 0:
@@ -300,8 +309,7 @@ class Hypotheses:
                 association.append(-1)
             else:
                 priors[place] = replace(priors[place], start=candidate.start)
-        found = self.fitted(innovation, priors, tuple(association))
-        return [found, *self.with_cause(innovation, manoeuvring, None, MEMORY, innovation.y, n.STEPS_WARM)]
+        return self.fitted(innovation, priors, tuple(association))
 
     def _of_anything(
         self, innovation: Innovation, tracked: Priors, before: Sequence[ScoredAnswer]
@@ -398,32 +406,42 @@ class Hypotheses:
         priors = started(discs.fit) if outlined is None else list(outlined)
         least = 0.0 if innovation.whole else float(n.ANOTHER)
         while (new := self._next_disc(innovation, discs)) is not None:
-            priors, association = [*priors, new], (*discs.association, -1)
-            # The next parts tell one outline from two discs.
             if discs.fit is None and innovation.scan.part and new.since_s > 0:
-                found.append(self.fitted(innovation, priors, association))
+                found += self._begun_within(innovation, new)
                 if found[-1].explained:
                     break
+            priors, association = [*priors, new], (*discs.association, -1)
             more = self.fitted(innovation, [*started(discs.fit), plain(new)], association)
             if more.score < discs.score + least:
                 break
             if discs.fit is None:
-                priors, more = self._several(innovation, new, more)
+                priors, more = self._or_several(innovation, new, more)
             discs = more
             found += self._outlined(innovation, priors, discs)
         return found
 
-    def _several(
+    def _begun_within(self, innovation: Innovation, new: TouchPrior) -> list[ScoredAnswer]:
+        """What began within a part: several discs, else one of any outline. The next parts tell one from the others."""
+        several = self.several(innovation, new.since_s)
+        if several is not None and several.explained:
+            return [several]
+        return [*([] if several is None else [several]), self.fitted(innovation, [new], (-1,))]
+
+    def _or_several(
         self, innovation: Innovation, one: TouchPrior, answer: ScoredAnswer
     ) -> tuple[list[TouchPrior], ScoredAnswer]:
-        """Several discs at once, where they are likelier than the answer of one alone: that may lie between them."""
-        tells = answer.chi2 < n.MOST
-        several = [] if tells else self.detector.several(innovation, one.since_s)
-        if priors := [self._begun(innovation, each) for each in several]:
-            found = self.fitted(innovation, [plain(prior) for prior in priors], (-1,) * len(priors))
-            if found.score > answer.score:
-                return priors, found
-        return [one], answer
+        """Several discs, where they are likelier than the answer of one alone."""
+        several = self.several(innovation, one.since_s) if answer.chi2 > n.MOST else None
+        if several is None or several.score <= answer.score:
+            return [one], answer
+        return list(begun_as(several.fit, innovation.span_s)), several
+
+    def several(self, innovation: Innovation, since_s: float, least: int = 2) -> ScoredAnswer | None:
+        """So many discs at once, or more, which began at an instant that is known roughly: one alone may lie between
+        them. None where they are fewer.
+        """
+        priors = [plain(self._begun(innovation, each)) for each in self.detector.several(innovation, since_s)]
+        return self.fitted(innovation, priors, (-1,) * len(priors)) if len(priors) >= least else None
 
     def _next_disc(self, innovation: Innovation, discs: ScoredAnswer) -> TouchPrior | None:
         """The likeliest one in what others leave; None where it would not be seen, or may not be looked for."""

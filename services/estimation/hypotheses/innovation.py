@@ -197,9 +197,9 @@ def begun_at(state: Array, span_s: float, since_s: float = -np.inf, until_s: flo
     return replace(free, start=state, since_s=since_s, until_s=until_s)
 
 
-def begun_as(fit: FoundTouches, span_s: float) -> tuple[TouchPrior, ...]:
+def begun_as(fit: FoundTouches | None, span_s: float) -> tuple[TouchPrior, ...]:
     """The touches of a fit, each of them anywhere."""
-    found = zip(fit.states, fit.priors, strict=True)
+    found = () if fit is None else zip(fit.states, fit.priors, strict=True)
     return tuple(begun_at(state, span_s, prior.since_s, prior.until_s) for state, prior in found)
 
 

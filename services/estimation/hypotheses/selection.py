@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.numbers import LINE_SCANS
-from models.measurement.touch import LOG_RADIUS, TouchPrior, anywhere
+from models.measurement.touch import TouchPrior, anywhere
 from models.measurement.whitening import Whitening
 from services.estimation.faults.board import BoardView
 from services.estimation.filter import Prediction
@@ -25,7 +25,6 @@ from services.estimation.hypotheses.innovation import (
 )
 from services.estimation.hypotheses.split_merge import SplitMergeTest
 from services.estimation.tared import GridInformation, TaredSkin
-from services.estimation.track import may_be_several
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -125,18 +124,14 @@ class HypothesisSelection:
         return self._associated(own, found)
 
     def _begun_recounted(self, hypotheses: Hypotheses, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
-        """Of a part: an answer, or with two touches instead of one that has just begun."""
-        if answer.fit is None or not answer.explained:
+        """Of a part: an answer, or with more touches where all of them have just begun."""
+        if answer.fit is None or not (answer.explained and all(map(self._grown, answer.fit.priors))):
             return answer
         own = replace(innovation, budget=StepBudget.of(1.0, separate=False), keeps=0.0)
-        split = SplitMergeTest(hypotheses, False, float(n.RECOUNT_GAIN))
-        broad = answer.fit.states[:, LOG_RADIUS] > np.log(n.BROAD)  # not shown yet; others are, before they are asked
-        for k, (place, prior) in enumerate(zip(answer.association, answer.fit.priors, strict=True)):
-            odd = broad[k] or may_be_several(answer.fit.shapes[k])
-            due = odd and (place >= 0 or broad[k]) and self._grown(prior)
-            if due and (found := split.of_begun(own, answer, k)) is not None:
-                return self._associated(innovation, replace(found, over=answer.over + found.score - answer.score))
-        return answer
+        found = SplitMergeTest(hypotheses, False, float(n.RECOUNT_GAIN)).of_begun(own, answer)
+        if found is None:
+            return answer
+        return self._associated(innovation, replace(found, over=answer.over + found.score - answer.score))
 
     def _grown(self, prior: TouchPrior) -> bool:
         """Whether what is measured of a touch that began within this scan has grown by 2^0.5."""

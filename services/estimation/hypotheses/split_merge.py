@@ -18,7 +18,7 @@ from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anyw
 from services.estimation.hypotheses.detector import DiscActions
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import Innovation, Priors, ScoredAnswer, begun_as, likeliest, started
-from services.estimation.overlap import apart, neighbours
+from services.estimation.overlap import neighbours
 from services.estimation.track import may_be_several, oddness
 from services.estimation.values import numbers as n
 
@@ -63,15 +63,15 @@ class SplitMergeTest:
             return None
         return likeliest(others)
 
-    def of_begun(self, innovation: Innovation, answer: ScoredAnswer, one: int) -> ScoredAnswer | None:
-        """Two discs instead of one of an answer's touches, which has just begun: None where they are not likelier."""
+    def of_begun(self, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer | None:
+        """More discs than an answer has, whose touches have all just begun: None where they are not likelier."""
         assert answer.fit is not None
-        found = next(self._halved(innovation, answer, one), None)  # discs alone
-        if found is None or found.fit is None or not (found.explained and apart(found.fit.states, found.association)):
+        since_s = min(prior.since_s for prior in answer.fit.priors)
+        found = self._hypotheses.several(innovation, since_s, answer.count + 1)
+        if found is None or not found.explained:
             return None
-        priors, places = started(answer.fit), list(answer.association)
-        priors[one], places[one] = begun_as(answer.fit, innovation.span_s)[one], -1  # what parts told counts once
-        same = self._hypotheses.fitted(innovation, priors, tuple(places))
+        begun = begun_as(answer.fit, innovation.span_s)  # what parts told counts once
+        same = self._hypotheses.fitted(innovation, begun, (-1,) * len(begun))
         return found if found.score > same.score + self._least_gain else None
 
     def _same(self, innovation: Innovation, answer: ScoredAnswer, begun: Priors) -> list[ScoredAnswer]:
