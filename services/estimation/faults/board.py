@@ -290,9 +290,10 @@ class BoardFaults:
         best, least = None, answer.score + odds
         for k, change in enumerate(changes, 1):
             asked, column = self._given(innovation.leaving(1 - k / len(changes)), columns, change)
-            found = ask(asked, change, _evidence_of(column, answer) + change.log_prior > 0)
             goes_on = not change.is_gain and change.electrode == self.now.contact and self.began_within(view)
-            score = found.score + (0.0 if goes_on else change.log_prior)
+            log_prior = 0.0 if goes_on else change.log_prior
+            found = ask(asked, change, _evidence_of(column, answer) + log_prior > 0)
+            score = found.score + log_prior
             if score >= least and self._believed(change, column, found, score, answer):
                 best, least = (change, column, asked, found), score
         if best is None:

@@ -79,15 +79,15 @@ class HypothesisSelection:
         manoeuvring = self.skin.touches.expected(self.measured, manoeuvring=True)
         if self.skin.touches.lost:
             return _judged_by_itself(hypotheses, innovation, tracked, manoeuvring)
-        for answer in self._first_of_whole(hypotheses, innovation, tracked):
+        for answer in self._first(hypotheses, innovation, tracked):
             if answer.explained:
                 return answer
         return hypotheses.ask(innovation, tracked, manoeuvring)
 
-    def _first_of_whole(
-        self, hypotheses: Hypotheses, innovation: Innovation, tracked: Priors
-    ) -> Iterator[ScoredAnswer]:
-        """What is asked of a whole scan before all else."""
+    def _first(self, hypotheses: Hypotheses, innovation: Innovation, tracked: Priors) -> Iterator[ScoredAnswer]:
+        """What is asked before all else."""
+        if self.unexplained_s > n.CHANGING_S:  # a track of then may explain that nothing touches, as one of no force
+            yield hypotheses.untouched(innovation)
         if not self.measured.whole:
             return
         if self.unexplained_s > 0 and self._due and not self.searched:
