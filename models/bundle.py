@@ -25,7 +25,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -61,12 +61,15 @@ class BundleError(EitskinError):
 class Bundle:
     """A bundle whose hashes were found right."""
 
-    path: Path
-    manifest: dict[str, Any]
-    matrices: Matrices
+    path: Path = field(compare=False)
+    manifest: dict[str, Any] = field(compare=False)
+    matrices: Matrices = field(compare=False)
     hash: str  # of the whole: sha256 of manifest.json, which holds the hashes of everything else; as SHA256 says
-    locator: LocatorArrays | None = None  # of a registered skin: what finds touches by the measured response map
-    mounted_fields: npt.NDArray[np.float32] | None = None  # of a calibrated one: its response tables' as it is mounted
+    locator: LocatorArrays | None = field(
+        default=None, compare=False
+    )  # of a registered skin: what finds touches by the measured response map
+    # of a calibrated one: its response tables' as it is mounted
+    mounted_fields: npt.NDArray[np.float32] | None = field(default=None, compare=False)
 
     @property
     def name(self) -> str:

@@ -26,6 +26,7 @@ from services.estimation.initialisation.baseline import TAKING, Baseline, NoBase
 from services.estimation.tared import KnownBaseline
 from services.estimation.values.estimate import Estimate, Judgement, TouchEstimate
 from services.estimation.values.scan import Scan
+from services.estimation.values.state import saved
 from services.judged import judged
 from services.linearisation import Linearisation
 from services.runtime.config import Skin
@@ -97,7 +98,7 @@ class Preprocessing(Stage):
         self.revision += 1
         if baseline is None:
             return
-        if baseline.taken_by == "file" and self.references.noise is not None:
+        if baseline.taken_by == "file" and self.references.now.noise is not None:
             sigma = self.references.sigma(baseline, self.pre)
         else:
             sigma = baseline.sigma / self.pre.normaliser(baseline.z0)
@@ -199,7 +200,7 @@ class Preprocessing(Stage):
         holds = out.touched and self.config.touch.hold and not self.always_reconstruct
         made = self._reconstruction(d, out.sigma, out.scan) if holds else Reconstructed(d, 1)
         if made is None:
-            out.held, out.reconstructed = self._reconstruction.scan > 0, self._reconstruction.scan
+            out.held, out.reconstructed = self._reconstruction.now.scan > 0, self._reconstruction.now.scan
             self._counters["held"] += out.held
             return
         out.difference = made.difference.astype(np.float32)
@@ -238,7 +239,7 @@ class Preprocessing(Stage):
 
     def _beside_reference(self, frame: RawFrame) -> bool:
         """A scan that stands by itself is compared with the reference just before it, and with no other."""
-        if self.baseline is None or frame.scan != self.references.scan + 1:
+        if self.baseline is None or frame.scan != self.references.now.scan + 1:
             self._forget_baseline()
             self._problem = f"the reference of scan {frame.scan} did not come: it cannot be compared"
             return False
@@ -388,13 +389,13 @@ class Preprocessing(Stage):
             "touched": self._touched,
             "told_ns": self._announced_ns,
             "continuity": self.continuity.state(),
-            "hold": self._reconstruction.state(),
+            "hold": saved(self._reconstruction.now),
             "estimator": self.estimator.state(),
             "bundle": self.bundle.hash,
             "baseline": baseline.to_dict() if baseline else None,
             "trusted": self._trusted.to_dict() if self._trusted else None,
             "undated_s": self._undated_s,
-            "references": self.references.state(),
+            "references": saved(self.references.now),
             "parts": list(self._part),
             "board": self._board,
             "last_sample_ns": self._sample_ns,

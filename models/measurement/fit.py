@@ -77,8 +77,7 @@ class FittedScan:
     course: TouchCourse
     misfit: Array  # (K, K) of trace 1
     live: int  # measurements that count
-    known: KnownWhitening | None = None  # of a moment ago, as good as this covariance's own
-    turned: Turned | None = None  # of a moment ago
+    before: FoundTouches | None = None  # of a moment ago, whose whitening and directions are as good as its own
     sample_s: float = 0.0  # for when what is found is said, from the middle of the scan on
 
 
@@ -174,7 +173,6 @@ class TouchFitter:
         rest = self._turn(states, self._mean[self._states :])
         columns = self._columns(states)
         self._whiten(states, columns)
-        states, columns = self._first_actions(states, columns)
         point = self._descend(self._linearised(states, rest, columns), most_steps)
         changed, moved = not self._known.fits(_size2(point.columns)), self._moved(point.states)
         rest = self._turn(point.states, point.rest) if moved else point.rest
@@ -196,7 +194,8 @@ class TouchFitter:
         """Take the touches' own directions anew, and how their courses may bend. Returns shapes and kinks as far as
         they are the same as in rest (N,), the others at their means.
         """
-        course, known, before = self._scene.course, self._scene.turned, self._kinks
+        scene, course, before = self._scene, self._scene.course, self._kinks
+        known = None if scene.before is None else scene.before.turned
         self._bends = course.bends(states, self._priors)
         if known is None or not known.near(states) or (self._shaped and not known.directions):
             known = Turned(states, course.directions(states) if self._shaped else [])
@@ -247,7 +246,7 @@ class TouchFitter:
 
     def _whiten(self, states: Array, columns: TouchColumns) -> None:
         size2, scene = max(_size2(columns), n.TINY), self._scene
-        known = scene.known
+        known = None if scene.before is None else scene.before.known
         if known is not None and known.fits(size2):
             self._known = known
             return
@@ -255,24 +254,6 @@ class TouchFitter:
         diagonal = diagonal_of(covariance)
         diagonal += scene.course.jitter(states, self._priors) ** 2
         self._known = KnownWhitening(Whitening.of(covariance), size2)
-
-    def _first_actions(self, states: Array, columns: TouchColumns) -> tuple[Array, TouchColumns]:
-        """Touches whose action nobody knows yet begin with the likeliest."""
-        unknown = np.flatnonzero(states[:, ACTION] == 0)
-        if not len(unknown):
-            return states, columns
-        states = states.copy()
-        states[unknown, ACTION] = n.LEAST_ACTION
-        columns = self._columns(states)
-        at = STATES * unknown + ACTION
-        response = self._known.white(columns.slopes[:, at])
-        known = columns.mean - columns.slopes[:, at].sum(axis=1) * n.LEAST_ACTION
-        seen = self._known.white(np.expm1(self._scene.y) - known)
-        found = np.linalg.lstsq(response, seen, rcond=None)[0]
-        states[unknown, ACTION] = np.maximum(found, n.LEAST_ACTION)
-        columns = self._columns(states)
-        self._whiten(states, columns)
-        return states, columns
 
     def _linearised(self, states: Array, rest: Array, columns: TouchColumns) -> _Linearisation:
         y, states_of = self._scene.y, columns.slopes.shape[1]

@@ -44,7 +44,7 @@ class DiscResponse:
         self._pixel = 2.0 / len(jacobian)
         self._borders: Array = np.linspace(-1.0, 1.0, len(jacobian) + 1)  # of pixels
         self._axis: Array = self._borders[:-1] + self._pixel / 2
-        self.discs = _on_the_skin(_grid_of_discs(), inside)  # (A, 3) x, y, log radius: all over the skin
+        self.discs = _discs_on(inside)  # (A, 3) x, y, log radius: all over the skin
 
     def __call__(self, x: float, y: float, log_radius: float) -> Array:
         """(K,)"""
@@ -62,7 +62,8 @@ class DiscResponse:
         """(9, K) the touch's own directions, see models/measurement/touch.py."""
         at = self._covered(x, y, log_radius)
         found = np.empty((SHAPES, self._jacobian.shape[2]))
-        outlines = np.stack([*self._outlines(at, x, y), self._edge(at)])
+        blur = 0.5 * (n.EDGE_WIDTH / self._pixel) ** 2  # of variance w^2: w^2 / 2 times the Laplacian
+        outlines = np.stack([*self._outlines(at, x, y), blur * laplace(at.shares[0], mode="constant")])
         found[:-2] = self._sum(self._jacobian, at, outlines)
         found[-2] = self._sum(self._along, at, at.shares[:1])[0]
         found[-1] = self._sum(self._turned, at, at.shares[:1])[0]
@@ -94,10 +95,6 @@ class DiscResponse:
         waves = [turned**harmonic for harmonic in HARMONICS]
         return [at.shares[3] * part for wave in waves for part in (wave.real, wave.imag)]
 
-    def _edge(self, at: Covered) -> Array:
-        """A blur of variance w^2 adds w^2 / 2 times the Laplacian."""
-        return np.asarray(0.5 * (n.EDGE_WIDTH / self._pixel) ** 2 * laplace(at.shares[0], mode="constant"))
-
     def _sum(self, table: NDArray[np.float32], at: Covered, weights: Array) -> Array:
         """(c, K) of weights (c, n, m)."""
         block = table[at.rows, at.columns].reshape(-1, table.shape[2])
@@ -122,18 +119,15 @@ def _disc_below(x: Array, y: Array) -> Array:
     return below
 
 
-def _grid_of_discs() -> Array:
+def _discs_on(inside: NDArray[np.bool_]) -> Array:
+    """(A, 3) of RADII, whose centres are on the skin; inside (F, F): its pixels."""
     found = list[Array]()
     for radius, step in RADII:
         reach = n.SHEET - INWARD * radius
         axis = np.linspace(-reach, reach, 1 + round(2 * reach / step))
         x, y = np.meshgrid(axis, axis)
         found.append(np.column_stack([x.ravel(), y.ravel(), np.full(x.size, np.log(radius))]))
-    return np.concatenate(found)
-
-
-def _on_the_skin(discs: Array, inside: NDArray[np.bool_]) -> Array:
-    """Those whose centres are; inside (F, F): its pixels."""
+    discs = np.concatenate(found)
     pixels = np.floor((discs[:, :2] + 1) / 2 * len(inside)).astype(int)
     return np.asarray(discs[inside[pixels[:, 1], pixels[:, 0]]])
 

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Generic, TypeVar
-from weakref import WeakValueDictionary
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.polynomial import Legendre
@@ -26,7 +22,6 @@ FIELD_MODES = [(d - j, j) for d in range(MOST_DEGREE + 1) for j in range(d + 1)]
 FIELD_DEGREES = tuple(i + j for i, j in FIELD_MODES)  # of each mode
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -231,24 +226,5 @@ def _of_trace_one(covariance: Array) -> Array:
     return np.asarray(covariance / np.trace(covariance))
 
 
-class ByBundle(Generic[T]):
-    """A function of a bundle that remembers, by its hash. Each tare that calibrates makes a bundle with a hash of its
-    own, so what is kept is bounded: whatever somebody still holds is shared, and beside that the few that were made
-    last are kept for who comes next. Threads may share it; two that ask at once may both make one.
-    """
-
-    def __init__(self, make: Callable[[Bundle], T], most: int) -> None:
-        """most: so many are kept that nobody holds."""
-        self._make = make
-        self._held: WeakValueDictionary[str, T] = WeakValueDictionary()
-        self._newest: deque[T] = deque(maxlen=most)
-
-    def __call__(self, bundle: Bundle) -> T:
-        found = self._held.get(bundle.hash)
-        if found is None:
-            found = self._held[bundle.hash] = self._make(bundle)
-            self._newest.append(found)
-        return found
-
-
-skin_tables = ByBundle(tables_of, most=2)  # 14 MB each
+skin_tables = lru_cache(maxsize=4)(tables_of)
+"""Of a bundle, by its hash: 14 MB each, and each tare that calibrates makes a bundle of its own."""

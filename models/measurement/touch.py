@@ -53,9 +53,10 @@ class TouchPrior:
 
 def anywhere(x: float, y: float, action: float, span_s: float) -> TouchPrior:
     """A touch that may be anywhere on the sheet, of any size, begin and move as touches do. span_s: of the scan."""
+    action = max(action, n.LEAST_ACTION)
     start = np.array([x, y, np.log(n.TYPICAL_RADIUS), action, 0.0, 0.0, 0.0])
     mean = np.array([0.0, 0.0, np.log(n.TYPICAL_RADIUS), 0.0, 0.0, 0.0, 0.0])
-    rate_sd, way_sd = n.BEGINS_WITHIN * max(action, n.LEAST_ACTION) / span_s, n.NEW_WAY / span_s
+    rate_sd, way_sd = n.BEGINS_WITHIN * action / span_s, n.NEW_WAY / span_s
     sd = np.array([ANYWHERE_SD, ANYWHERE_SD, n.AREA_LOG_SD, n.MOST_ACTION, rate_sd, way_sd, way_sd])
     return TouchPrior(start, mean, sd)
 

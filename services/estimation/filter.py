@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from models.measurement.fit import FoundTouches
 from models.measurement.tables import FIELD_DEGREES, SkinTables
@@ -59,6 +60,7 @@ class FilterState:
     remainder: Annotated[Array, "K"]
     remainder_variance: Annotated[Array, "K"]
     memories: list[Memory] = field(default_factory=list)
+    process_noise_scale: float = 1.0  # times the faster drift's variance: grows while nothing explains the skin
 
 
 @dataclass(frozen=True)
@@ -121,13 +123,8 @@ class SkinFilter:
 
     def shift(self, at_s: float) -> Array:
         """(K,) log |Z| over the baseline, predicted: `predict` without its covariance."""
-        now, passed_s = self.now, self._passed_s(at_s)
-        x = now.x.copy()
-        x[FIELD] += passed_s * x[RATES]
-        if now.memories:
-            x[self._fixed :] *= np.tile(np.exp(-passed_s / FADES_S), len(now.memories))
         columns, seen = self._columns()
-        return np.asarray(columns @ x[seen] + now.remainder)
+        return np.asarray(columns @ self._moved_mean(self._passed_s(at_s))[seen] + self.now.remainder)
 
     def common_mode_variance(self, at_s: float) -> float:
         """Of what all measurements share, but for contacts."""
@@ -219,14 +216,10 @@ class SkinFilter:
 
     def remember(self, memory: Memory) -> None:
         """A touch went, or moved away."""
-        now, size = self.now, len(self.now.x)
+        now = self.now
         grown = np.exp(np.minimum(self._passed_s(memory.at_s) / FADES_S, 20.0))  # the filter stands before that
         now.x = np.concatenate([now.x, memory.action * n.MEMORY_SHARE * grown])
-        p = np.zeros((size + STATES_OF_MEMORY, size + STATES_OF_MEMORY))
-        p[:size, :size] = now.p
-        own = np.arange(size, size + STATES_OF_MEMORY)
-        p[own, own] = (memory.action * n.MEMORY_SD * grown) ** 2
-        now.p = p
+        now.p = block_diag(now.p, np.diag((memory.action * n.MEMORY_SD * grown) ** 2))
         now.memories.append(memory)
 
     def beyond_memory(self, predicted: Prediction, weighted_residual: Array, white: Whitening) -> Memory | None:
@@ -251,11 +244,16 @@ class SkinFilter:
         first = self._fixed + STATES_OF_MEMORY * place
         return slice(first, first + STATES_OF_MEMORY)
 
+    def _moved_mean(self, passed_s: float) -> Array:
+        x = self.now.x.copy()
+        x[FIELD] += passed_s * x[RATES]
+        x[self._fixed :] *= np.tile(np.exp(-passed_s / FADES_S), len(self.now.memories))
+        return x
+
     def _moved(self, passed_s: float, flicker: Array) -> tuple[Array, Array]:
-        x, p = self.now.x.copy(), self.now.p.copy()
+        x, p = self._moved_mean(passed_s), self.now.p.copy()
         if not passed_s:
             return x, p
-        x[FIELD] += passed_s * x[RATES]
         p[FIELD] += passed_s * p[RATES]
         p[:, FIELD] += passed_s * p[:, RATES]
         modes = np.arange(MODES)
@@ -268,7 +266,6 @@ class SkinFilter:
         if count := len(self.now.memories):
             fade = np.tile(np.exp(-passed_s / FADES_S), count)
             memories = slice(self._fixed, None)
-            x[memories] *= fade
             p[memories] *= fade[:, None]
             p[:, memories] *= fade
             grown[memories] = (n.MEMORY_WALK * x[memories]) ** 2 * passed_s / np.tile(FADES_S, count)

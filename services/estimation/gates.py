@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from copy import copy, deepcopy
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.fit import KnownWhitening, Turned
-from models.measurement.noise import BURST_BLOCK, NoiseModel
+from models.measurement.fit import FoundTouches
+from models.measurement.noise import NoiseModel
 from models.measurement.response import DiscGrid
 from models.measurement.whitening import Whitening
 from services.estimation.filter import FilterState, SkinFilter
+from services.estimation.hypotheses.detector import newest_z2
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
 
@@ -27,20 +27,6 @@ class Glance:
     at_s: float
     white: Whitening
     common_mode_variance: float  # of what all values share, by the filter
-    newest: dict[int, tuple[NDArray[np.intp], Array]] = field(default_factory=dict)  # by the part measured last
-
-    @cached_property
-    def common_information(self) -> float:
-        """Information of what all values have in common."""
-        return float(np.sum(self.white.w.sum(axis=1) ** 2))
-
-    def newest_of(self, part: int, ages_s: Array) -> tuple[NDArray[np.intp], Array]:
-        """(b,) rows of the newest block, (b, b) inverse of their precision. ages_s (K,): of scans with this part."""
-        if part not in self.newest:
-            rows = np.argpartition(ages_s, BURST_BLOCK)[:BURST_BLOCK]
-            own = self.white.w[:, rows]
-            self.newest[part] = rows, np.asarray(np.linalg.inv(own.T @ own), float)
-        return self.newest[part]
 
 
 @dataclass(frozen=True)
@@ -50,8 +36,7 @@ class SteadyGlance:
     at_s: float
     ids: tuple[int, ...]
     covariance: Array  # (K, K) without touches
-    white: KnownWhitening  # with them
-    turned: Turned
+    fit: FoundTouches  # of them
 
 
 @dataclass(frozen=True)
@@ -86,7 +71,7 @@ class NullGate:
         if (fit := answer.fit) is None:
             self._glances[alike] = Glance(at_s, innovation.white, self._drift.common_mode_variance(at_s))
         elif answer.cause == AS_IT_IS and answer.explained:
-            self._steady[alike] = SteadyGlance(at_s, ids, innovation.covariance, fit.known, fit.turned)
+            self._steady[alike] = SteadyGlance(at_s, ids, innovation.covariance, fit)
 
     def steady(self, measured: Observation, ids: tuple[int, ...]) -> SteadyGlance | None:
         """None: nothing is known of such scans under these touches."""
@@ -103,11 +88,9 @@ class NullGate:
         residual = known.white(y)
         weighted_residual = known.white.w.T @ residual
         chi2 = float(residual @ residual) / max(int(np.count_nonzero(y)), 1)
-        rows, energy = known.newest_of(measured.scan.part, measured.scan.ages_s)
-        own = weighted_residual[rows]
-        fresh = float(own @ energy @ own) - len(own)
-        z2 = max(self._grid.likeliest(weighted_residual, information)[0], fresh)
-        even = float(weighted_residual.sum()) ** 2 / known.common_information < n.GAIN_Z2
+        newest = newest_z2(measured, known.white, weighted_residual)
+        z2 = max(self._grid.likeliest(weighted_residual, information)[0], newest)
+        even = float(weighted_residual.sum()) ** 2 < n.GAIN_Z2 * float(np.sum(known.white.w.sum(axis=1) ** 2))
         return Seen(chi2 < n.QUIET and z2 < n.GLANCE_Z2 and even, z2, weighted_residual, y)
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from models.bundle import Bundle
 from models.measurement.numbers import TINY
 from models.prereconstruction import Drift, Operator, PreReconstructor
 from services.estimation.values.numbers import LEAST_LIVE
-from services.estimation.values.state import shaped
+from services.estimation.values.state import loaded
 
 Array = NDArray[np.float64]
 Key = TypeVar("Key")
@@ -85,6 +85,18 @@ class Reconstructed(NamedTuple):
     averaged: int  # scans
 
 
+@dataclass
+class HeldTouch:
+    """All that changes of how one touch is reconstructed."""
+
+    live: Annotated[NDArray[np.bool_] | None, "K"] = None  # measurements that count in the mean
+    reference: Annotated[Array | None, "K"] = None  # the difference last reconstructed
+    averaged: int = 0  # frames in it
+    recent: list[Annotated[Array, "K"]] = field(default_factory=list)  # frames since the last change, at most
+    count: int = 0  # of those, all
+    scan: int = 0  # number of the one last reconstructed; 0: none yet of this touch
+
+
 class Reconstruction:
     """Of one skin, against one baseline: which frames of a touch are reconstructed, and from what: those since it last
     changed, by the whitened energy of an image's operator. The limit allows for the noise having been estimated from
@@ -106,12 +118,7 @@ class Reconstruction:
 
     def reset(self) -> None:
         """Nothing touches."""
-        self._live: NDArray[np.bool_] | None = None  # measurements that count in the mean
-        self._reference: Array | None = None  # the difference last reconstructed
-        self._averaged = 0  # frames in it
-        self._recent: deque[Array] = deque(maxlen=LONGEST_MEAN)
-        self._count = 0  # frames since the last change
-        self.scan = 0  # number of the one last reconstructed; 0: none yet of this touch
+        self.now = HeldTouch()
 
     def __call__(self, d: Array, sigma: NDArray[np.float32], scan: int) -> Reconstructed | None:
         """Of a scan's difference and its standard deviation (K,), infinite where a measurement does not count. None:
@@ -124,47 +131,31 @@ class Reconstruction:
         if self._limit is None or self._limit[0] is not operator:
             self._limit = operator, operator.threshold(CHANGED, self.frames)
         live = np.isfinite(sigma)
-        if self._live is None or (live != self._live).any():  # frames of other measurements make another image
+        if self.now.live is None or (live != self.now.live).any():  # frames of other measurements make another image
             self.reset()
-        self._live = live
-        if self._reference is not None:
-            variance = 1 + 1 / self._averaged  # of the change, in units of one frame's
-            if operator.score(d - self._reference) > variance * self._limit[1]:
-                self._recent.clear()
-                self._count = 0
-        self._recent.append(d)
-        self._count += 1
-        if self._reference is not None and self._count not in MEANS and self._count % LONGEST_MEAN:
+        now = self.now
+        now.live = live
+        if now.reference is not None:
+            variance = 1 + 1 / now.averaged  # of the change, in units of one frame's
+            if operator.score(d - now.reference) > variance * self._limit[1]:
+                now.recent, now.count = [], 0
+        now.recent = [*now.recent[1 - LONGEST_MEAN :], d]
+        now.count += 1
+        if now.reference is not None and now.count not in MEANS and now.count % LONGEST_MEAN:
             return None
-        self._reference = np.mean(self._recent, axis=0)
-        self._averaged, self.scan = len(self._recent), scan
-        return Reconstructed(self._reference, self._averaged)
+        now.reference = np.mean(now.recent, axis=0)
+        now.averaged, now.scan = len(now.recent), scan
+        return Reconstructed(now.reference, now.averaged)
 
     def prepare(self) -> bool:
         """Make the operator that the next touch needs first; False: it is there."""
         return self._operators.prepare(self.sigma.astype(np.float32), 1, self.frames)
 
-    def state(self) -> dict[str, Any]:
-        return {
-            "reference": self._reference,
-            "averaged": self._averaged,
-            "recent": np.array(self._recent),
-            "count": self._count,
-            "scan": self.scan,
-            "live": None if self._live is None else self._live.astype(np.uint8),
-        }
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Raises KeyError, TypeError or ValueError where it does not fit."""
-        self.reset()
-        reference, shape = state["reference"], self.sigma.shape
-        self._reference = None if reference is None else shaped(reference, shape)
-        self._averaged, self._count, self.scan = int(state["averaged"]), int(state["count"]), int(state["scan"])
-        self._recent.extend(shaped(row, shape) for row in state["recent"])
-        if (live := state.get("live")) is not None:  # older recordings have none
-            self._live = shaped(live, shape) > 0
-        if self.scan < 0 or (self._reference is not None and self._averaged < 1):
-            raise ValueError(f"a hold of {self._averaged} frames since scan {self.scan}: expected 1 or more, from 0 on")
+    def load(self, state: Any) -> None:
+        """Raises ValueError where it does not fit."""
+        self.now = loaded(HeldTouch, state, {"K": len(self.sigma)})
+        if self.now.scan < 0 or (self.now.reference is not None and self.now.averaged < 1):
+            raise ValueError(f"a hold since scan {self.now.scan}, averaged {self.now.averaged}: expected 0 on, 1 on")
 
 
 MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through

@@ -4,7 +4,7 @@ whatever pressed while nothing explained the scans may have left in the foam.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -29,37 +29,29 @@ class PendingScan:
     drifts: float  # times faster drift; 0: as slowly as before
 
 
-@dataclass
-class LearningState:
-    """All that changes."""
-
-    waiting: list[PendingScan] = field(default_factory=list)
-
-
 class DelayedUpdate:
     """The filter's update by untouched scans, with a fixed lag of two: none by what turns out to be a touch's begin."""
 
     def __init__(self, drift: SkinFilter, noise: NoiseModel) -> None:
         self._drift, self._noise = drift, noise
-        self.now = LearningState()
+        self.now = list[PendingScan]()  # those that wait, oldest first
 
     def doubt(self) -> None:
         """Something touches, or may: what waits is not believed."""
-        self.now.waiting = []
+        self.now = []
 
     def stepped(self) -> None:
         """The gain has, of late: what was taken for drift may have been that."""
-        self.now.waiting = [scan for scan in self.now.waiting if not scan.drifts]
+        self.now = [scan for scan in self.now if not scan.drifts]
 
     def untouched(self, scan: PendingScan) -> None:
         """A scan on which nothing touches, by all that is known: `catch_up` learns from those that waited enough."""
-        self.now.waiting.append(scan)
+        self.now.append(scan)
 
     def catch_up(self) -> None:
         """Takes longer than a look at a quiet scan: what is said of a scan does not wait for it."""
-        waiting = self.now.waiting
-        if len(waiting) > n.LAG_SCANS:
-            self._update(waiting.pop(0))
+        if len(self.now) > n.LAG_SCANS:
+            self._update(self.now.pop(0))
 
     def _update(self, scan: PendingScan) -> None:
         if scan.drifts:

@@ -153,9 +153,10 @@ class ScanStep:
             return None
         if not self._plain or (known := skin.null_gate.steady(measured, skin.touches.ids)) is None:
             return None
-        innovation = Innovation(*measured.fields, self._y, known.covariance, information.each)
+        wide = skin.touches.now.wide
+        innovation = Innovation(*measured.fields, self._y, known.covariance, information.each, wide=wide)
         expected = skin.touches.expected(measured)
-        answer = skin.hypotheses.fitted(innovation, expected, most_steps=1, known=known.white, turned=known.turned)
+        answer = skin.hypotheses.fitted(innovation, expected, most_steps=1, before=known.fit)
         return (innovation, answer) if answer.explained and answer.next_touch_z2 < n.GLANCE_Z2 else None
 
     # --- answers ---
@@ -273,7 +274,7 @@ class ScanStep:
         if not roughly:
             skin.faults.gain_holds(measured.end_s)
         if cause == AS_IT_IS:
-            skin.hypotheses.process_noise_scale = 1.0
+            skin.drift.now.process_noise_scale = 1.0
 
     def _refused(self, innovation: Innovation, answer: ScoredAnswer) -> None:
         """Nothing explains it: the longer that lasts, the further the skin may have drifted."""
@@ -283,8 +284,7 @@ class ScanStep:
             skin.refused.refuse(innovation.y, span_s)
             now.unexplained_s += span_s
             if skin.tables.predicted and now.unexplained_s > n.CHANGING_S:
-                scale = skin.hypotheses.process_noise_scale * n.ADRIFT
-                skin.hypotheses.process_noise_scale = min(n.MOST_ADRIFT, scale)
+                skin.drift.now.process_noise_scale = min(n.MOST_ADRIFT, skin.drift.now.process_noise_scale * n.ADRIFT)
         unexplained, change = (float(np.sum(innovation.white(each) ** 2)) for each in (answer.residual, innovation.y))
         if not answer.nearly_holds and unexplained > n.STRANGE * change:  # the likeliest touches leave most of it
             now.unexplained_s = max(now.unexplained_s, float(n.CHANGING_S))
@@ -329,7 +329,7 @@ class ScanStep:
         self.now.wholes += 1
         if odd:
             return
-        drifts = skin.hypotheses.process_noise_scale if cause == DRIFT else 0.0
+        drifts = skin.drift.now.process_noise_scale if cause == DRIFT else 0.0
         if drifts:
             skin.null_gate.forget()
         over = measured.log_z - skin.log_z0

@@ -19,7 +19,7 @@ from services.estimation.gates import NullGate, SlowOnsetTest, SlowState
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.initialisation.start import EarlierBaseline
 from services.estimation.initialisation.tare import AgreedScans
-from services.estimation.learning import DelayedUpdate, LearningState, RefusedState, UnexplainedLoad
+from services.estimation.learning import DelayedUpdate, PendingScan, RefusedState, UnexplainedLoad
 from services.estimation.touches import TouchesState, TouchTracks
 from services.estimation.values import numbers as n
 
@@ -63,12 +63,10 @@ class TaredState:
     lines: LineState
     drift: FilterState
     touches: TouchesState
-    learning: LearningState
+    learning: list[PendingScan]
     faults: FaultState
     refused: RefusedState
     slow: SlowState
-    process_noise_scale: float
-    wide: bool
     aged: list[FilterState]  # of a baseline that was adopted, by how old it may be; empty after the first scan
 
 
@@ -135,8 +133,6 @@ class TaredSkin:
         made = TaredSkin(tables, self.baseline)
         for name in ("noise", "lines", "touches", "learning", "faults"):
             made._learners[name].now = self._learners[name].now
-        made.hypotheses.process_noise_scale = self.hypotheses.process_noise_scale
-        made.hypotheses.wide = self.hypotheses.wide
         made.drift.succeed(self.drift)
         made.aged = self.aged
         return made
@@ -153,8 +149,7 @@ class TaredSkin:
         self.null_gate.forget()
         self.grid_information = None
         learnt = {name: each.now for name, each in self._learners.items()}
-        scale, wide = self.hypotheses.process_noise_scale, self.hypotheses.wide
-        return TaredState(self.baseline, **learnt, process_noise_scale=scale, wide=wide, aged=self.aged)
+        return TaredState(self.baseline, **learnt, aged=self.aged)
 
     def load(self, state: TaredState) -> None:
         """Raises ValueError where the drift's covariance is none."""
@@ -166,5 +161,4 @@ class TaredSkin:
             )
         for name, each in self._learners.items():
             each.now = getattr(state, name)
-        self.hypotheses.process_noise_scale, self.hypotheses.wide = state.process_noise_scale, state.wide
         self.aged = state.aged

@@ -28,6 +28,7 @@ class TouchesState:
     tracks: list[TrackedTouch] = field(default_factory=list)
     dropped: list[TrackedTouch] = field(default_factory=list)  # of late, as vague: what is found there anew is theirs
     next_id: int = 1
+    wide: bool = False  # they were explained by a response that is wrong by more than it should be
     watched: bool = True  # the scan before was looked at: what a scan shows now began meanwhile
 
 
@@ -236,10 +237,6 @@ class TouchTracks:
             return True
         found = zip(fit.states, association, strict=True)
         return all(distance(self.now.tracks[place].state, state) < n.SAME_TOUCH for state, place in found)
-
-    def remove(self, place: int) -> None:
-        """It was none."""
-        del self.now.tracks[place]
 
     def _new(self, fit: FoundTouches, k: int, measured: Observation) -> TrackedTouch:
         prior, state, at_s = fit.priors[k], fit.states[k], measured.middle_s

@@ -31,8 +31,8 @@ def update_tracks(
             touches.now.dropped = []  # what is found where one was dropped is a new one
     skin.remember(memories)
     wide = answer.fit is not None and answer.wide
-    if answer.explained and wide != skin.hypotheses.wide:
-        skin.hypotheses.wide = wide
+    if answer.explained and wide != skin.touches.now.wide:
+        skin.touches.now.wide = wide
         skin.null_gate.forget()
 
 
@@ -99,4 +99,4 @@ def _doubt(skin: TaredSkin, innovation: Innovation, answer: ScoredAnswer, measur
             acts = len(touches) == 1 or track.z2 > n.ACTS_Z2  # alone: something touches, be its strength known or not
             track.confirmed = track.scans >= n.SURE_SCANS and acts and not strange  # several scans need it
     if none:
-        touches.remove(max(none)[1])
+        del touches.now.tracks[max(none)[1]]

@@ -216,7 +216,7 @@ def _noise(sigma: Array, z0: Array, rows: int, of: str) -> str:
 
 
 def _noise_of_references(data: Input, pipeline: Pipeline) -> str:
-    found = pipeline.pre.references.noise
+    found = pipeline.pre.references.now.noise
     if found is None or data.reference is None:
         return "not known: no `reference` could be used"
     return _noise(found, np.ones(len(found)), min(len(data.reference), TARE_ROWS), "`reference`")

@@ -16,7 +16,7 @@ from models.patterns import adjacent, pairs
 from models.shapes import Shape
 from protocol.scan_setting import COHERENT
 from services.estimation.faults.impedance import Change, ContactColumns, Unexplained, gain_change
-from services.estimation.faults.wires import BoardScan, WireFault, WireKind, WireMaps, WireTable, any_touches
+from services.estimation.faults.wires import BoardScan, WireFault, WireKind, WireMaps, any_touches
 from services.runtime.config import ScanMode
 from simulation.faults import CONTACT_RISES, ROWS, FaultRow
 from simulation.host import LATE_S, SimulatedHost, tared
@@ -189,8 +189,8 @@ def test_a_fault_is_told_by_one_scan_whatever_touches_and_also_where_it_begins_o
             failed = ~np.isfinite(z) | (z <= 0) | (status != 0)
             log_z, live = np.log(np.where(failed, 1.0, z)), np.ones(len(z), bool)
             scan = BoardScan(log_z, untouched(), failed, live, MEASURED_S)
-            assert WireTable(MAPS).suspicious(scan, standing)
-            first, *others = WireTable(MAPS).guesses(scan, standing, every_touch, 2 * NOISE**2 * np.eye(len(PATTERN)))
+            assert MAPS.suspicious(scan, standing)
+            first, *others = MAPS.guesses(scan, standing, every_touch, 2 * NOISE**2 * np.eye(len(PATTERN)))
             assert first.fault == expected
             assert first.score > max(guess.score for guess in others if guess.fault != expected) + 50
             assert before is after or abs(first.since_s - 0.05 * SPAN_S) < 0.06 * SPAN_S

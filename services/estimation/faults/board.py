@@ -23,7 +23,7 @@ from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice, wires
 from services.estimation.faults.contact_state import JUMP, ContactState
 from services.estimation.faults.impedance import MOST_LOG, Change, ContactColumns, Unexplained, gain_change, gain_onset
-from services.estimation.faults.wires import BoardScan, WireFault, WireKind, WireMaps, WireTable
+from services.estimation.faults.wires import BoardScan, WireFault, WireKind, WireMaps
 from services.estimation.filter import Prediction
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
@@ -133,7 +133,6 @@ class BoardFaults:
         self._any_touch, self._known, self._noise = any_touch, known, noise
         self.member = wires.members(tables.pattern)
         self.maps = WireMaps(tables.pattern)
-        self._table = WireTable(self.maps)
         self._columns = ContactColumns.of(tables)
         self._predicted, self._tells = tables.predicted, tables.tells
         self._places = tables.places
@@ -225,7 +224,7 @@ class BoardFaults:
 
     def suspects_wires(self, view: BoardView) -> bool:
         """Whether it is worth asking if the wires have changed."""
-        return view.failed.mean() < n.SILENT and self._table.suspicious(self._wire_scan(view), self.now.wire)
+        return view.failed.mean() < n.SILENT and self.maps.suspicious(self._wire_scan(view), self.now.wire)
 
     def wires_changed(self, view: BoardView, touched: Array, skin: Array, own: Array) -> bool:
         """Whether the wires are otherwise than they were. touched (K,): relative change by touches that stand; skin and
@@ -233,7 +232,7 @@ class BoardFaults:
         """
         now, untouched = self.now, self._wire_scan(view)
         scan = replace(untouched, predicted=untouched.predicted + np.log1p(touched))
-        found = self._table.guesses(scan, now.wire, skin + self._any_touch, own)
+        found = self.maps.guesses(scan, now.wire, skin + self._any_touch, own)
         best, stands = found[0], next(guess for guess in found if guess.fault == now.wire)
         rival = max(guess.score for guess in found if guess.fault != best.fault)
         if best.fault == now.wire or best.score < max(stands.score + n.WIRE_SURE, rival + n.WIRE_APART):

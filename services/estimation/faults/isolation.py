@@ -118,7 +118,7 @@ class FaultIsolation:
                 continue
             other = self._explain_without(found, k)
             if other is not None:
-                self._touches.remove(k)
+                del self._touches.now.tracks[k]
                 return other
         return found
 

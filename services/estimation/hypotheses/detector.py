@@ -14,7 +14,7 @@ from models.measurement.numbers import COURSE_S
 from models.measurement.response import DiscGrid
 from models.measurement.touch import LOG_RADIUS, PLACE
 from models.measurement.whitening import Whitening, leave_out
-from services.estimation.hypotheses.innovation import ONSETS, Innovation, ScoredAnswer
+from services.estimation.hypotheses.innovation import ONSETS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -166,9 +166,8 @@ class TouchDetector:
         return np.asarray(shares)
 
 
-def newest_z2(innovation: Innovation, answer: ScoredAnswer) -> float:
+def newest_z2(measured: Observation, white: Whitening, weighted_residual: Array) -> float:
     """Energy of the newest block of measurements beyond what it is expected to have, all others given."""
-    newest = innovation.order >= len(innovation.y) - BURST_BLOCK
-    own, weighted_residual = answer.white.w[:, newest], answer.weighted_residual[newest]
-    energy = weighted_residual @ np.linalg.solve(own.T @ own, weighted_residual)
-    return float(energy) - BURST_BLOCK
+    newest = measured.order >= len(weighted_residual) - BURST_BLOCK
+    own, left = white.w[:, newest], weighted_residual[newest]
+    return float(left @ np.linalg.solve(own.T @ own, left)) - BURST_BLOCK

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.course import SUDDEN_STEPS, TURN_STEPS, TouchCourse
-from models.measurement.fit import LEAST_MEAN, FittedScan, KnownWhitening, TouchFitter, Turned
+from models.measurement.fit import LEAST_MEAN, FittedScan, FoundTouches, TouchFitter
 from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
 from models.measurement.numbers import AT_ONCE_S, LEAST_ACTION, MISFIT_WIDE
 from models.measurement.tables import SkinTables
@@ -102,8 +102,6 @@ class Hypotheses:
         self._through_wire: tuple[WireFault, Hypotheses] | None = None  # through a fault of the wires
         # Touches that nothing explains for certain must not be taken for noise.
         self._wider = WIDER if tables.predicted else (MEMORY, DRIFT, BURST)
-        self.process_noise_scale = 1.0  # times the faster drift: grows while nothing explains the skin
-        self.wide = False  # the tracked touches were explained by a response that is wrong by more than it should be
 
     def _set_tables(self, tables: SkinTables) -> None:
         self._tables, self.grid, self.response = tables, tables.grid, tables.response
@@ -129,7 +127,7 @@ class Hypotheses:
 
     def inflated_drift(self) -> Array:
         """(K, K)"""
-        faster = self._drift.inflated_process_noise(self.process_noise_scale)
+        faster = self._drift.inflated_process_noise(self._drift.now.process_noise_scale)
         return faster if self._slopes is None else np.asarray(self._slopes @ faster @ self._slopes.T)
 
     # --- nothing touches ---
@@ -142,7 +140,7 @@ class Hypotheses:
         score = white.log_density - 0.5 * energy + LOG_PRIORS[cause]
         chi2 = energy / max(int(innovation.live.sum()), 1)
         answer = ScoredAnswer(cause, None, (), chi2, np.inf, score, white, white.w.T @ whitened, innovation.y)
-        z2 = max(self.detector.best(innovation, answer).z2, newest_z2(innovation, answer))
+        z2 = max(self.detector.best(innovation, answer).z2, newest_z2(innovation, white, answer.weighted_residual))
         if not self._tables.predicted:
             z2 = max(z2, float(n.FALSE_ALARM_Z2 / n.QUIET) * chi2)
         return replace(answer, next_touch_z2=z2)
@@ -374,22 +372,22 @@ class Hypotheses:
         most_steps: float = n.STEPS_COLD,
         cause: str = AS_IT_IS,
         wide: bool | None = None,
-        known: KnownWhitening | None = None,
-        turned: Turned | None = None,
+        before: FoundTouches | None = None,
     ) -> ScoredAnswer:
-        """association: None: priors are those of the tracks. known, turned: of a moment ago, as good as its own."""
+        """association: None: priors are those of the tracks. before: the same of a moment ago, whose
+        whitening and directions are as good as its own."""
         association = tuple(range(len(priors))) if association is None else association
-        wide = self.wide if wide is None else wide
+        wide = innovation.wide if wide is None else wide
         course = TouchCourse(self.response, innovation.times_s, innovation.span_s)
         live, tables = int(innovation.live.sum()), self._tables
         misfit = self._misfit_wide if wide else tables.wrong
         covariance = innovation.covariance if tables.map is None else innovation.covariance + tables.map.error
         sample_s = innovation.sample_s - innovation.middle_s
-        scene = FittedScan(innovation.y, covariance, course, tables.misfit, live, known, turned, sample_s)
+        scene = FittedScan(innovation.y, covariance, course, tables.misfit, live, before, sample_s)
         affordable = max(0.0, innovation.budget.left - innovation.keeps) / len(priors)
         fit = TouchFitter(scene, priors, misfit).fit(min(int(most_steps), int(affordable)))
         innovation.budget.left -= (fit.steps + 1) * len(fit)
-        cost = n.LOG_PRIOR_WIDE if wide and not self.wide else LOG_PRIORS[cause]
+        cost = n.LOG_PRIOR_WIDE if wide and not innovation.wide else LOG_PRIORS[cause]
         score = fit.evidence + cost + innovation.touch_log_prior * sum(place < 0 for place in association)
         near = innovation.whole and not apart(fit.states, association)
         of_fit = fit.chi2, np.inf, score, fit.white, fit.weighted_residual, fit.left

@@ -100,6 +100,7 @@ class Innovation(Observation):
     information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
     candidates: tuple[TouchPrior, ...] = ()  # touches that nearly explained the scan before, or this one
     places: tuple[int, ...] = ()  # of each the tracked one that it continues; -1: it is new
+    wide: bool = False  # touches that stand were explained by a response that is wrong by more than it should be
     keeps: float = 0.0  # steps that are left to who asks next
 
     @property

@@ -62,7 +62,8 @@ class HypothesisSelection:
         ids = skin.touches.ids
         places = tuple(ids.index(each.id) if each.id in ids else -1 for each in self.left_open)
         fields = replace(self.measured, live=view.live).fields
-        return Innovation(*fields, view.y, covariance, known.each, candidates, places).leaving(n.FOR_FAULTS)
+        wide = skin.touches.now.wide
+        return Innovation(*fields, view.y, covariance, known.each, candidates, places, wide).leaving(n.FOR_FAULTS)
 
     def answer(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
         """The likeliest one."""
@@ -93,7 +94,7 @@ class HypothesisSelection:
         if self.unexplained_s > 0 and self._due and not self.searched:
             self.searched = True  # they may be others than those that are tracked
             yield self._from_nothing(hypotheses, innovation)
-        if hypotheses.wide:  # they stay as they are, and their response is as wrong as it should be
+        if innovation.wide:  # they stay as they are, and their response is as wrong as it should be
             yield hypotheses.fitted(innovation, tracked, most_steps=n.STEPS_WARM, wide=False)
 
     def _of_untouched(self, hypotheses: Hypotheses, innovation: Innovation) -> ScoredAnswer:
@@ -110,8 +111,7 @@ class HypothesisSelection:
         """An answer, or more touches, or fewer, with steps of its own: a bad one has spent those of the scan."""
         if not self._recount_due(answer):
             return self._begun_recounted(hypotheses, innovation, answer) if self.measured.scan.part else answer
-        separate = self.measured.scan.separate
-        own = replace(innovation, budget=StepBudget.of(1.0, separate), keeps=0.0)
+        separate, own = self.measured.scan.separate, self._with_own_steps(innovation)
         recount = SplitMergeTest(hypotheses, separate, self.skin.touches.recount_gain)
         other = found = recount(own, answer)
         while other is not None and not own.spent:
@@ -127,11 +127,15 @@ class HypothesisSelection:
         """Of a part: an answer, or with more touches where all of them have just begun."""
         if answer.fit is None or not (answer.explained and all(map(self._grown, answer.fit.priors))):
             return answer
-        own = replace(innovation, budget=StepBudget.of(1.0, separate=False), keeps=0.0)
-        found = SplitMergeTest(hypotheses, False, float(n.RECOUNT_GAIN)).of_begun(own, answer)
+        test = SplitMergeTest(hypotheses, False, float(n.RECOUNT_GAIN))
+        found = test.of_begun(self._with_own_steps(innovation), answer)
         if found is None:
             return answer
         return self._associated(innovation, replace(found, over=answer.over + found.score - answer.score))
+
+    def _with_own_steps(self, innovation: Innovation) -> Innovation:
+        """To be recounted: a response that explains everything would hide how many there are."""
+        return replace(innovation, budget=StepBudget.of(1.0, self.measured.scan.separate), keeps=0.0, wide=False)
 
     def _grown(self, prior: TouchPrior) -> bool:
         """Whether what is measured of a touch that began within this scan has grown by 2^0.5."""

@@ -6,7 +6,6 @@ one touch looks like two.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from copy import copy
 from dataclasses import replace
 from itertools import takewhile
 
@@ -36,8 +35,7 @@ class SplitMergeTest:
         others least_gain [nat] decides.
         """
         self._separate, self._least_gain = separate, 0.0 if separate else least_gain
-        self._hypotheses = copy(hypotheses)
-        self._hypotheses.wide = False  # what explains everything would hide how many there are
+        self._hypotheses = hypotheses
 
     def __call__(self, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer | None:
         """Other touches than those of an answer, where they are likelier: None where they are not."""

@@ -7,8 +7,8 @@ from __future__ import annotations
 import hashlib
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from models.measurement.numbers import LEAST_NOISE, MEDIAN_DEVIATION
 from models.prereconstruction import PreReconstructor, noise_of_frames, shrunk
 from protocol.errors import EitskinError
 from services.estimation.values import numbers
-from services.estimation.values.state import shaped
+from services.estimation.values.state import loaded
 
 Array = NDArray[np.float64]
 
@@ -239,6 +239,16 @@ def implausibility(z0: Array, pre: PreReconstructor) -> float:
     return float(nnls(columns, np.ones(int(live.sum())))[1] / live.sum() ** 0.5)
 
 
+@dataclass
+class ReferencesState:
+    """All that changes."""
+
+    typical: Annotated[Array, "K"]  # |Z| of the scans that noise was found from; 0 where nothing was measured
+    row: list[Annotated[Array, "K", "gaps"]] = field(default_factory=list)  # scans that came one after the other
+    noise: Annotated[Array | None, "K"] = None  # relative, of one scan
+    scan: int = -1  # number of the last one
+
+
 class References:
     """Baselines of K measurements from scans of the untouched skin that stand in one file: each is the baseline of what
     follows it, together they tell the noise. Their order says nothing: neither when they were taken nor how long one
@@ -251,14 +261,11 @@ class References:
         self.reset()
 
     def reset(self) -> None:
-        self._row: list[Array] = []  # those that came one after the other, without another scan in between
-        self.noise: Array | None = None  # (K,) relative, of one scan
-        self.typical = np.zeros(self._k)  # (K,) |Z| of the scans that it was found from; 0 where nothing was measured
-        self.scan = -1  # number of the last one
+        self.now = ReferencesState(np.zeros(self._k))
 
     def interrupted(self) -> None:
         """Another scan than a reference came."""
-        self._row.clear()
+        self.now.row.clear()
 
     def baseline(
         self, amplitude: Array, scan: int, board: str, sample_ns: int, pre: PreReconstructor
@@ -266,36 +273,31 @@ class References:
         """The baseline that this scan's |Z| (K,) is, NaN where a measurement failed; None where half of it did. It is
         in doubt where `pre` predicts another skin.
         """
-        self.scan, good = scan, in_proportion(np.log(np.where(amplitude > 0, amplitude, np.nan))[None])
+        now, good = self.now, in_proportion(np.log(np.where(amplitude > 0, amplitude, np.nan))[None])
+        now.scan = scan
         if good.sum() < self._k / 2:
             return None
-        self._row.append(np.where(good, amplitude, np.nan))
-        del self._row[:-MOST_ROWS]
-        if self.noise is None or len(self._row) > 1:
-            rows = np.array(self._row)
-            self.noise = noise_of_references(rows)
-            self.typical = np.nan_to_num(_quietly(lambda scans: np.nanmedian(scans, axis=0), rows))
-        z0, sigma = np.where(good, amplitude, 0.0), np.where(good, self.noise * amplitude, np.inf)
+        now.row.append(np.where(good, amplitude, np.nan))
+        del now.row[:-MOST_ROWS]
+        if now.noise is None or len(now.row) > 1:
+            rows = np.array(now.row)
+            now.noise = noise_of_references(rows)
+            now.typical = np.nan_to_num(_quietly(lambda scans: np.nanmedian(scans, axis=0), rows))
+        z0, sigma = np.where(good, amplitude, 0.0), np.where(good, now.noise * amplitude, np.inf)
         off = unlike(z0, sigma, pre)
         doubt = f"the reference is {off}: {SEE}" if off else self.doubt
         return Baseline(z0, sigma, 1, board, sample_ns, doubt, taken_by="file")
 
     def sigma(self, baseline: Baseline, pre: PreReconstructor) -> Array:
         """(K,) noise of d against this baseline: that of a typical scan, so that operators are made once for all."""
-        known = self.typical > 0
-        share = np.divide(self.typical, pre.normaliser(self.typical), out=np.zeros(len(self.typical)), where=known)
-        return np.where(np.isfinite(baseline.sigma) & known, self.noise * share, np.inf)
+        typical = self.now.typical
+        known = typical > 0
+        share = np.divide(typical, pre.normaliser(typical), out=np.zeros(len(typical)), where=known)
+        return np.where(np.isfinite(baseline.sigma) & known, self.now.noise * share, np.inf)
 
-    def state(self) -> dict[str, Any]:
-        return {"row": np.array(self._row), "noise": self.noise, "typical": self.typical, "scan": self.scan}
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Raises KeyError, TypeError or ValueError where it does not fit."""
-        self.reset()
-        self._row = [shaped(row, (self._k,), finite=False) for row in state["row"]]
-        self.noise = None if state["noise"] is None else shaped(state["noise"], (self._k,))
-        self.typical = shaped(state["typical"], (self._k,))
-        self.scan = int(state["scan"])
+    def load(self, state: Any) -> None:
+        """Raises ValueError where it does not fit."""
+        self.now = loaded(ReferencesState, state, {"K": self._k})
 
 
 def forms(scans: Array) -> Array:

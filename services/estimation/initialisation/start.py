@@ -27,7 +27,7 @@ from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
 from models.measurement.tables import SkinTables
 from models.measurement.touch import PLACE, RATE, TouchPrior, anywhere
 from models.measurement.whitening import Whitening, leave_out
-from services.estimation.faults.wires import BoardScan, WireFault, WireMaps, WireTable, any_touches
+from services.estimation.faults.wires import BoardScan, WireFault, WireMaps, any_touches
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Judgement, Verdict, judge
 
@@ -207,8 +207,7 @@ class WiringTest:
     """Which fault of the wires explains the first scans. tables: of the skin's bundle."""
 
     def __init__(self, tables: SkinTables) -> None:
-        self.maps = WireMaps(tables.pattern)
-        self._tables, self._table = tables, WireTable(self.maps)
+        self.maps, self._tables = WireMaps(tables.pattern), tables
 
     @cached_property
     def _covariances(self) -> list[Array]:
@@ -226,12 +225,12 @@ class WiringTest:
         predicted = expected + float(np.median((log_z - expected)[live]))
         at_once = np.zeros(len(log_z))
         scan = BoardScan(np.where(live, log_z, 0.0), predicted, ~live, np.ones_like(live), at_once)
-        if not self._table.suspicious(scan, None):
+        if not self.maps.suspicious(scan, None):
             return None
         own = np.diag(np.where(live, variance, 1.0))
         best = dict[WireFault | None, float]()
         for times, covariance in zip(LADDER, self._covariances, strict=True):
-            for guess in self._table.guesses(scan, None, covariance, own):
+            for guess in self.maps.guesses(scan, None, covariance, own):
                 score = guess.score - float(np.log(times))
                 best[guess.fault] = max(best.get(guess.fault, -np.inf), score)
         first, *others = sorted(best, key=lambda fault: -best[fault])

@@ -14,7 +14,6 @@ from functools import cache
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
 T = TypeVar("T")
 Sizes = dict[str, int]
@@ -116,11 +115,3 @@ def _array(kind: Any, found: Any, sizes: Sizes, dimensions: tuple[str, ...], whe
 def _misfit(where: str, found: Any, expected: str) -> ValueError:
     what = f"an array of {found.dtype}, {found.shape}" if isinstance(found, np.ndarray) else repr(found)[:60]
     return ValueError(f"{where}: found {what}, expected {expected}")
-
-
-def shaped(values: Any, shape: tuple[int, ...], finite: bool = True) -> NDArray[np.float64]:
-    """The array of a saved state, checked. Raises ValueError."""
-    found = np.array(values, dtype=np.float64)
-    if found.shape != shape or (finite and not np.isfinite(found).all()):
-        raise ValueError(f"found an array of shape {found.shape}, expected {shape}, finite")
-    return found
