@@ -239,9 +239,8 @@ class ScanStep:
         return found
 
     def _explanation(self) -> Explanation:
-        skin, measured = self.skin, self.measured
+        skin, measured, now = self.skin, self.measured, self.now
         predicted = skin.drift.predict(measured.middle_s, skin.noise.now.flicker)
-        now = self.now
         selection = HypothesisSelection(skin, measured, predicted, now.unexplained_s, now.candidates, now.wholes)
         return FaultIsolation(skin, measured, predicted).explain(selection)
 

@@ -237,9 +237,10 @@ class BoardFaults:
         rival = max(guess.score for guess in found if guess.fault != best.fault)
         if best.fault == now.wire or best.score < max(stands.score + n.WIRE_SURE, rival + n.WIRE_APART):
             return False
-        if now.wire is None and best.score < self._by_gain(view, touched, skin + own) + n.WIRE_APART:
+        few = (self._known & (view.at.times_s >= best.since_s)).sum() < n.CHANGE_ROWS  # anything explains them
+        if few or (now.wire is None and best.score < self._by_gain(view, touched, skin + own) + n.WIRE_APART):
             return False
-        now.wire, now.wire_since_s, now.unexplained_scans = best.fault, view.at.middle_s + best.since_s, 0
+        now.wire, now.wire_since_s = best.fault, view.at.middle_s + best.since_s
         return True
 
     def _by_gain(self, view: BoardView, touched: Array, covariance: Array) -> float:
@@ -276,8 +277,8 @@ class BoardFaults:
         what they explain. doubted (7,): a touch that stands and lies on an electrode: without it.
         """
         view, innovation, answer = without.view, without.innovation, without.answer
-        if innovation.budget.left <= 0:  # what is left open is asked again with the scans that follow
-            return None
+        if innovation.budget.left <= 0 or innovation.live.sum() < n.CHANGE_ROWS:
+            return None  # what is left open is asked again with the scans that follow
         columns = self.columns
         if self.now.contact >= 0:  # about the contact that stands changed
             columns = columns.with_change(self.now.contact, self.now.size)
