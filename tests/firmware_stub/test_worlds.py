@@ -61,8 +61,7 @@ def test_a_constant_force_creeps_and_fades_as_the_sum_over_small_steps(creep: Ex
 def test_a_residue_stays_where_a_touch_was_and_no_truth_tells() -> None:
     rig = shown("creep", track(1.0, 4.0))
     during, after = rig.field.at(3.0), rig.field.at(4.5)
-    assert during.touches[0].drop == 0.4 and 0.002 < during.touches[0].crept < 0.06
-    assert not after.touches
+    assert during.touches[0].drop == 0.4 and 0.002 < during.touches[0].crept < 0.06 and not after.touches
     (residue,) = after.residues
     assert (residue.x, residue.y) == (0.01, 0.0) and 0.002 < residue.drop < 0.4 * 0.08
     assert all(left.drop < residue.drop / 2 for left in rig.field.at(60.0).residues)

@@ -110,8 +110,7 @@ def test_next_frame_waits_as_long_as_the_newest_one_holds(line, skin):
     line.send(valid_for_s=30.0)
     assert skin.next_frame().seq == 0
     line.send(valid_for_s=0.4, after_s=20.0)
-    assert skin.next_frame().seq == 1
-    assert waited() == 0.4 and waited(0.05) == 0.05
+    assert skin.next_frame().seq == 1 and waited() == 0.4 and waited(0.05) == 0.05
     line.send(valid_for_s=0.1)
     skin.next_frame()
     assert waited() == 0.25, "at least"

@@ -70,6 +70,16 @@ def named(host: SimulatedHost, row: FaultRow, at: float, over: float) -> bool:
     return said or any(set(row.names) & set(f.reasons) for t, f in host.contacts if at <= t <= over + 0.1)
 
 
+def test_a_short_that_begins_with_a_touch_is_no_other_fault_that_explains_the_newest_value() -> None:
+    host, at = tared("rolling"), BEGINS_S + 0.0385
+    (cues,) = (row.cues({"electrodes": [5, 11]}, at, 1.5) for row in ROWS if row.title == "electrodes_shorted")
+    press = DiscPress(0.015, 0.0, at + 0.003, 60.0, 5.0, ramp=0.01)
+    host.rig.field.play(host.rig.timeline(script(press, cues=cues), 0.0), host.now)
+    host.until(at + 1.4)
+    host.close()
+    assert sum(not frame.valid for when, frame in host.contacts if when > at) < 10
+
+
 def test_every_fault_of_the_stub_has_a_row_with_arguments_that_it_takes() -> None:
     assert {row.fault for row in ROWS} == set(FAULTS) | {CONTACT_RISES}
     known = Faults()

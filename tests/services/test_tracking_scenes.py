@@ -119,6 +119,5 @@ def test_one_that_ends_while_two_overlap_is_gone(lifted, away):
     found = skin.feel((stays,)).contact
     assert found.valid
     (contact,) = lasting(found)
-    assert contact.id == same
-    assert np.linalg.norm(np.array(contact.position[:2]) - place) < 3e-3
+    assert contact.id == same and np.linalg.norm(np.array(contact.position[:2]) - place) < 3e-3
     assert not present(skin.rest(6))
