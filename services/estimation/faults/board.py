@@ -590,7 +590,7 @@ class BoardFaults:
         """(E,) of the wire format."""
         now = self.now
         plain = abs(now.size) > n.CONTACT_PLAIN and not now.doubt.beside
-        named = plain or not now.doubt.undecided or now.doubt.seen >= n.NAMED_SCANS
+        named = plain or not now.doubt.undecided or now.doubt.seen >= n.SURE_SCANS
         contact = now.contact if named else -1
         return advice.states_of(len(now.settled), now.wire, now.opens, contact, now.silent)
 
@@ -600,7 +600,7 @@ class BoardFaults:
 
     def gain_gross(self, at_s: float) -> bool:
         """Whether the gain is as no sound board's, and has not lasted."""
-        return self.now.gross_since_s <= at_s < self.now.gross_since_s + n.GAIN_LASTS_S
+        return self.now.gross_since_s <= at_s < self.now.gross_since_s + n.LOST_S
 
     @property
     def sound(self) -> bool:
