@@ -454,6 +454,8 @@ class BoardFaults:
         now.size = max(before + n.CONTACT_CHANGES * sigmas, self._least_size)
         if now.size > before and not now.doubt.undecided:
             now.doubt.change(before, now.size)
+        elif self._impedance < 1 - n.CONTACT_STILL and before - now.size < n.TARE_JUMPS:  # as no touch makes it
+            self._note_jump(before - now.size)
         now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
         now.still_s, now.still_size, now.back_scans = 0.0, now.size, 0
 
@@ -555,16 +557,14 @@ class BoardFaults:
 
     def end_doubt(self, jumped: bool) -> None:
         """What has changed is the contact's, all of it. jumped: from one scan to the next."""
-        now = self.now
         if jumped:
-            self._note_jump(now.size - now.doubt.decided)
-        now.doubt.end(now.size)
+            self._note_jump(self.now.size - self.now.doubt.decided)
+        self.now.doubt.end(self.now.size)
 
     def _note_jump(self, size: float) -> None:
         """The changed contact jumped by so much."""
-        doubt = self.now.doubt
-        doubt.jumps = max(doubt.jumps, size)
-        self._noise.now.jumps[self.now.contact] = doubt.jumps**2
+        self.now.doubt.jumps = max(self.now.doubt.jumps, size)
+        self._noise.now.jumps[self.now.contact] = self.now.doubt.jumps**2
 
     def _come_back(self, home: float) -> None:
         """A contact is well again by itself. It jumps, if it did so at once, and by no more than a baseline's may."""
