@@ -59,15 +59,14 @@ class BundleError(EitskinError):
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle whose hashes were found right."""
+    """A bundle whose hashes were found right. Two are equal where their hashes are."""
 
     path: Path = field(compare=False)
     manifest: dict[str, Any] = field(compare=False)
     matrices: Matrices = field(compare=False)
     hash: str  # of the whole: sha256 of manifest.json, which holds the hashes of everything else; as SHA256 says
-    locator: LocatorArrays | None = field(
-        default=None, compare=False
-    )  # of a registered skin: what finds touches by the measured response map
+    # of a registered skin: what finds touches by the measured response map
+    locator: LocatorArrays | None = field(default=None, compare=False)
     # of a calibrated one: its response tables' as it is mounted
     mounted_fields: npt.NDArray[np.float32] | None = field(default=None, compare=False)
 

@@ -245,6 +245,7 @@ class SkinFilter:
         return slice(first, first + STATES_OF_MEMORY)
 
     def _moved_mean(self, passed_s: float) -> Array:
+        """(N,) of the states, after so many seconds."""
         x = self.now.x.copy()
         x[FIELD] += passed_s * x[RATES]
         x[self._fixed :] *= np.tile(np.exp(-passed_s / FADES_S), len(self.now.memories))

@@ -92,8 +92,8 @@ class HeldTouch:
     live: Annotated[NDArray[np.bool_] | None, "K"] = None  # measurements that count in the mean
     reference: Annotated[Array | None, "K"] = None  # the difference last reconstructed
     averaged: int = 0  # frames in it
-    recent: list[Annotated[Array, "K"]] = field(default_factory=list)  # frames since the last change, at most
-    count: int = 0  # of those, all
+    recent: list[Annotated[Array, "K"]] = field(default_factory=list)  # the newest frames since it last changed
+    count: int = 0  # frames since it last changed
     scan: int = 0  # number of the one last reconstructed; 0: none yet of this touch
 
 
@@ -155,7 +155,7 @@ class Reconstruction:
         """Raises ValueError where it does not fit."""
         self.now = loaded(HeldTouch, state, {"K": len(self.sigma)})
         if self.now.scan < 0 or (self.now.reference is not None and self.now.averaged < 1):
-            raise ValueError(f"a hold since scan {self.now.scan}, averaged {self.now.averaged}: expected 0 on, 1 on")
+            raise ValueError(f"a hold of {self.now.averaged} frames since scan {self.now.scan}: expected 1, from 0 on")
 
 
 MOST_DROP = 0.97  # S/m: a contact never cuts the sheet through

@@ -162,11 +162,11 @@ def test_rows_of_an_anisotropic_skin_become_valid_and_right() -> None:
     data, bundle, said = rows("anisotropy15"), Bundle.load("square16"), list[str]()
     palm = Skin(port="stub", bundle="square16", frame_id="palm")
     out = reconstruct(data, palm, bundle, warn=said.append, age_s=1.0, calibrate=True)
-    assert out["valid"].all() and out["count"][0] == 1
-    assert np.hypot(*(out["position"][0, 0] - [0.015, -0.015])) < 1e-3
-    newtons = FOAM.force("circle", 0.3, disc(0.05 * 0.25))
-    assert out["force"][0, 0] == pytest.approx(newtons, rel=0.15)
+    assert out["valid"].all() and out["count"][0] == 1 and np.hypot(*(out["position"][0, 0] - [0.015, -0.015])) < 1e-3
+    assert out["force"][0, 0] == pytest.approx(FOAM.force("circle", 0.3, disc(0.05 * 0.25)), rel=0.15)
     assert any("15 % better along" in text for text in said)
+    if reconstruct(data, palm, bundle, age_s=1.0)["valid"].any():
+        pytest.xfail("not calibrated, the press is two valid touches: docs/reliability.md")
 
 
 def test_rows_that_the_bundle_predicts_are_reconstructed_with_it_as_it_is() -> None:

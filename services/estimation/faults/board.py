@@ -454,7 +454,7 @@ class BoardFaults:
         now.size = max(before + n.CONTACT_CHANGES * sigmas, self._least_size)
         if now.size > before and not now.doubt.undecided:
             now.doubt.change(before, now.size)
-        elif self._impedance < 1 - n.CONTACT_STILL and before - now.size < n.TARE_JUMPS:  # as no touch makes it
+        elif self._impedance < 1 - n.CONTACT_STILL and 0 < before - now.size < n.TARE_JUMPS:  # as no touch makes it
             self._note_jump(before - now.size)
         now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
         now.still_s, now.still_size, now.back_scans = 0.0, now.size, 0

@@ -374,8 +374,7 @@ class Hypotheses:
         wide: bool | None = None,
         before: FoundTouches | None = None,
     ) -> ScoredAnswer:
-        """association: None: priors are those of the tracks. before: the same of a moment ago, whose
-        whitening and directions are as good as its own."""
+        """association: None: priors are those of the tracks. before: a fit of a moment ago, as good as its own."""
         association = tuple(range(len(priors))) if association is None else association
         wide = innovation.wide if wide is None else wide
         course = TouchCourse(self.response, innovation.times_s, innovation.span_s)
