@@ -25,7 +25,7 @@ from services.estimation.values.state import loaded, saved
 
 Array = NDArray[np.float64]
 
-LAYOUT = 31  # of a kept state
+LAYOUT = 32  # of a kept state
 
 
 @dataclass

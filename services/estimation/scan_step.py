@@ -33,7 +33,7 @@ from services.estimation.track import coasted
 from services.estimation.track_update import update_tracks
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, Judgement, TouchEstimate, Verdict, judge
-from services.estimation.values.scan import NANOSECOND, Scan
+from services.estimation.values.scan import NANOSECOND, PER_S, Scan
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class EstimatorState:
     whole_us: float = -np.inf  # board's clock at the end of the last whole scan
     wholes: int = 0  # whole scans since the tare
     unexplained_s: float = 0.0  # for how long nothing has explained the scans
-    noticed: bool = False  # the part before was the first that was not quiet, and was not asked about
+    quiet: bool = False  # the scan before was what noise makes
     candidates: list[OpenTouch] = field(default_factory=list)
     published: tuple[TouchEstimate, ...] = ()
     published_ns: int = 0  # `sample` for which that was
@@ -69,13 +69,14 @@ class ScanStep:
         self._bridge(gap_s)
         if (slow := self._slow_onset()) is not None:
             return self._conclude(*slow)
-        seen, noticed, self.now.noticed = self._glance(), self.now.noticed, False
+        seen, was_quiet, self.now.quiet = self._glance(), self.now.quiet, False
         if seen is not None and seen.quiet:
             return self._quiet(seen)
-        if seen is not None and not (noticed or self.measured.whole):
+        if seen is not None and self.measured.scan.part and was_quiet:
             # Something begins. Its first few values tell no place that could be shown, and asking what they are takes
-            # longer than the next part, which tells: it is asked about.
-            self.now.noticed = True
+            # longer than the next part, which tells: it is asked about. A whole scan is the one after that.
+            if self.measured.whole:
+                self.now.whole_us -= PER_S * self.measured.span_s * (1 - 2 * float(self.measured.scan.new.mean()))
             return self._estimate(seen.y, np.zeros(len(seen.y)), seen.z2, 1.0)
         if (goes_on := self._going_on()) is not None:
             return self._conclude(*goes_on)
@@ -119,9 +120,9 @@ class ScanStep:
         skin, measured, known = self.skin, self.measured, self.skin.grid_information
         if known is None or len(skin.touches) or not self._plain:
             return None
-        if measured.whole and skin.drift.remembers(measured.middle_s):
-            return None
-        return skin.null_gate.look(measured, self._y, known.each)
+        seen = skin.null_gate.look(measured, self._y, known.each)
+        memory = measured.whole and skin.drift.remembers(measured.middle_s)  # it may hide what presses again
+        return None if seen is not None and seen.quiet and memory else seen
 
     def _slow_onset(self) -> tuple[Innovation, ScoredAnswer] | None:
         """A touch where nothing touched, that no drift since a while ago explains: the filter is that of then."""
@@ -162,7 +163,7 @@ class ScanStep:
     # --- answers ---
 
     def _quiet(self, seen: Seen) -> Estimate:
-        skin, measured = self.skin, self.measured
+        skin, measured, self.now.quiet = self.skin, self.measured, True
         self._explained(AS_IT_IS)
         skin.remember(skin.refused.explained(measured.oldest_s))
         skin.faults.remember(seen.y, measured.whole)
@@ -185,6 +186,7 @@ class ScanStep:
             now.candidates = [OpenTouch(track.state, track.since_s) for track in vague]
         found = self._explain()
         innovation, answer, view = found.innovation, found.answer, found.view
+        now.quiet = answer.quiet
         # as sound wires would show it
         self.measured = replace(self.measured, log_z=view.untouched + view.y, live=view.live)
         if answer.nearly_holds:

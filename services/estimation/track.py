@@ -306,6 +306,11 @@ def may_be_several(shape: Array) -> bool:
     return oddness(shape) > n.ODD_OUTLINE or not shape.any()
 
 
+def is_broad(state: Array) -> bool:
+    """Whether a touch (7,) that has just come may be two that began together, and is where neither of them is."""
+    return bool(state[LOG_RADIUS] > np.log(n.BROAD))
+
+
 def distance(state: Array, other: Array) -> float:
     """Of the places of two states (7,) [unit]."""
     return float(np.hypot(*(state[PLACE] - other[PLACE])))

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from models.measurement.fit import FoundTouches
-from models.measurement.touch import LOG_RADIUS
 from services.estimation.filter import Memory
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer, started
 from services.estimation.tared import TaredSkin
-from services.estimation.track import TrackedTouch
+from services.estimation.track import TrackedTouch, is_broad
 from services.estimation.values import numbers as n
 
 
@@ -65,8 +62,7 @@ def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> No
 
 
 def _may_be_two(track: TrackedTouch) -> bool:
-    """One that has just come and is broad may be two that began together, and is where neither of them is."""
-    return bool(track.state[LOG_RADIUS] > np.log(n.BROAD)) and track.scans < n.SURE_SCANS
+    return is_broad(track.state) and track.scans < n.SURE_SCANS
 
 
 def _least_z2(skin: TaredSkin, answer: ScoredAnswer, separate: bool) -> float:

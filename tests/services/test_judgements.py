@@ -223,8 +223,8 @@ def test_a_whole_scan_is_new_and_of_parts_what_the_newest_ones_brought():
     assert scan.new.sum() == 12 and scan.ages_s[scan.new].max() < scan.ages_s[~scan.new].min()
     assert times_s(scan)[scan.new].mean() == pytest.approx(0.0, abs=1e-5)  # `sample` is the newest part's middle
     assert Scan.of(part(23), before).new.sum() == 36, "what a skipped message brought is new too"
-    assert Scan.of(part(30), before).new.all()
-    assert Scan.of(part(3), Scan.of(part(2000))).new.all()  # the board's clock began anew
+    assert Scan.of(part(30), before).new.all() and Scan.of(part(3), Scan.of(part(2000))).new.all()  # a clock began anew
+    assert Scan.of(replace(part(21), stamps={"sample": scan.sample_ns + 10**6}), before).at_ns == scan.at_ns + 4_000
     assert Scan.of(replace(part(3), age_us=np.zeros(120, "f4"))).duration_s > 0, "a board may say that it took no time"
 
 

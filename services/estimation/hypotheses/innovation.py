@@ -21,7 +21,6 @@ Priors = Sequence[TouchPrior]
 
 ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
-JUST_BEFORE_S = 1e-5  # a value: the next scans, by whose clock its time is rounded, must not leave it out
 LOG_PRIORS = {
     AS_IT_IS: 0.0,
     MEMORY: float(n.LOG_PRIOR_MEMORY),
@@ -114,9 +113,9 @@ class Innovation(Observation):
 
     @cached_property
     def instants(self) -> Array:
-        """(n,) before which values something may begin or end at once: what the last few alone say, the next tell."""
+        """(n,) midway between values: something may begin or end then. What the last few alone say, the next tell."""
         times_s = np.sort(self.times_s)
-        return np.asarray(times_s[times_s <= (ONSETS[-1] - 0.5) * self.span_s]) - JUST_BEFORE_S
+        return np.asarray(times_s[times_s <= (ONSETS[-1] - 0.5) * self.span_s] - 0.5 * self.span_s / len(times_s))
 
     def leaving(self, share: float) -> Innovation:
         """The same, which leaves so much of its steps to the next."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.numbers import LINE_SCANS
-from models.measurement.touch import TouchPrior, anywhere
+from models.measurement.touch import anywhere
 from models.measurement.whitening import Whitening
 from services.estimation.faults.board import BoardView
 from services.estimation.filter import Prediction
@@ -22,9 +22,11 @@ from services.estimation.hypotheses.innovation import (
     Priors,
     ScoredAnswer,
     StepBudget,
+    begun_as,
 )
 from services.estimation.hypotheses.split_merge import SplitMergeTest
 from services.estimation.tared import GridInformation, TaredSkin
+from services.estimation.track import is_broad, oddness
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -124,24 +126,24 @@ class HypothesisSelection:
         return self._associated(own, found)
 
     def _begun_recounted(self, hypotheses: Hypotheses, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
-        """Of a part: an answer, or with more touches where all of them have just begun."""
-        if answer.fit is None or not (answer.explained and all(map(self._grown, answer.fit.priors))):
+        """Of a part: an answer, or a likelier one of more discs where all touches have just begun, one odd or broad."""
+        fit, half_s = answer.fit, self.measured.span_s / 2
+        if fit is None or not answer.explained:
             return answer
-        test = SplitMergeTest(hypotheses, False, float(n.RECOUNT_GAIN))
-        found = test.of_begun(self._with_own_steps(innovation), answer)
-        if found is None:
+        odd = any(map(is_broad, fit.states)) or max(map(oddness, fit.shapes)) > n.ODD_OUTLINE
+        if not odd or any(prior.since_s < -half_s or prior.until_s < np.inf for prior in fit.priors):
+            return answer
+        own, begun = self._with_own_steps(innovation), begun_as(fit, innovation.span_s)  # what parts told counts once
+        found = hypotheses.several(own, min(prior.since_s for prior in begun), answer.count + 1)
+        if found is None or not found.explained:
+            return answer
+        if found.score <= hypotheses.fitted(own, begun, (-1,) * len(begun)).score + n.RECOUNT_GAIN:
             return answer
         return self._associated(innovation, replace(found, over=answer.over + found.score - answer.score))
 
     def _with_own_steps(self, innovation: Innovation) -> Innovation:
         """To be recounted: a response that explains everything would hide how many there are."""
         return replace(innovation, budget=StepBudget.of(1.0, self.measured.scan.separate), keeps=0.0, wide=False)
-
-    def _grown(self, prior: TouchPrior) -> bool:
-        """Whether what is measured of a touch that began within this scan has grown by 2^0.5."""
-        age, passed = 0.5 - prior.since_s / self.measured.span_s, float(self.measured.scan.new.mean())
-        grown = np.frexp(age**2)[1] > np.frexp(max(age - passed, n.TINY) ** 2)[1]
-        return bool(grown and age < 1 and prior.until_s == np.inf)
 
     def _associated(self, own: Innovation, found: ScoredAnswer) -> ScoredAnswer:
         """An answer whose touches are others than those that stood, or stand where one of them does."""

@@ -63,17 +63,6 @@ class SplitMergeTest:
             return None
         return likeliest(others)
 
-    def of_begun(self, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer | None:
-        """More discs than an answer has, whose touches have all just begun: None where they are not likelier."""
-        assert answer.fit is not None
-        since_s = min(prior.since_s for prior in answer.fit.priors)
-        found = self._hypotheses.several(innovation, since_s, answer.count + 1)
-        if found is None or not found.explained:
-            return None
-        begun = begun_as(answer.fit, innovation.span_s)  # what parts told counts once
-        same = self._hypotheses.fitted(innovation, begun, (-1,) * len(begun))
-        return found if found.score > same.score + self._least_gain else None
-
     def _same(self, innovation: Innovation, answer: ScoredAnswer, begun: Priors) -> list[ScoredAnswer]:
         """As many touches, as they are and by what else the answer explains its scan with."""
         ask, new = self._hypotheses, (-1,) * len(begun)

@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 
 NANOSECOND, US = 1e-9, 1e-6  # of clocks [s]
 PER_S = 1 / US
+CLOCKS_PART = 1e-3  # by which the board's clock and the host's part at most
 SHORTEST_S, LONGEST_S = 0.005, 2.0  # of a scan that any board measures
 
 
@@ -56,10 +57,15 @@ class Scan:
             ages_s = duration_s * (1 - (np.arange(count) + 0.5) / max(count, 1))
         end_us = frame.device_us + PER_S * newest_s
         sample_ns = frame.stamps.get("sample", 0)
+        at_ns = sample_ns + round(newest_s / 2 / NANOSECOND)
         valid, reasons = as_sent(frame)  # measurements that failed are left out
         new = np.ones(count, bool)
         if before is not None and before.board == frame.board and end_us > before.end_us:
             new = end_us - PER_S * ages_s > before.end_us
+            passed_ns = round((end_us - before.end_us) * US / NANOSECOND)
+            off_ns, most_ns = at_ns - before.at_ns - passed_ns, round(CLOCKS_PART * passed_ns)
+            if abs(off_ns) < newest_s / NANOSECOND:  # what the host's clock says of the board's changes as it learns
+                at_ns = before.at_ns + passed_ns + min(max(off_ns, -most_ns), most_ns)
         return cls(
             values=np.abs(frame.z.astype(np.complex128)),
             ages_s=ages_s,
@@ -68,7 +74,7 @@ class Scan:
             number=frame.scan,
             part=frame.part,
             end_us=end_us,
-            at_ns=sample_ns + round(newest_s / 2 / NANOSECOND),
+            at_ns=at_ns,
             sample_ns=sample_ns,
             duration_s=duration_s,
             board=frame.board,
