@@ -62,6 +62,7 @@ def _confirm(skin: TaredSkin, answer: ScoredAnswer, measured: Observation) -> No
 
 
 def _may_be_two(track: TrackedTouch) -> bool:
+    """Whether it is new and broad."""
     return is_broad(track.state) and track.scans < n.SURE_SCANS
 
 

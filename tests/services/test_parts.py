@@ -350,7 +350,7 @@ def test_parts_that_come_no_sooner_than_whole_scans_are_given_up():
 
 @pytest.mark.parametrize("touched", [False, True])
 def test_a_board_goes_from_parts_to_whole_scans_and_back(touched):
-    host = SimulatedHost("rolling", snr_db=80.0, seed=7)
+    host = SimulatedHost("rolling", snr_db=80.0, seed=7, keep=True)
     host.until(4.0)
     if touched:
         host.press(x=0.02, y=-0.01, force=2.0, radius=0.01, seconds=60.0)
@@ -366,7 +366,7 @@ def test_a_board_goes_from_parts_to_whole_scans_and_back(touched):
         assert good[-1] > host.now - 0.06 and good[0] < asked + 0.25 and np.diff(good).max() < 0.15
         assert sum(len(frame.contacts) != touched for _, frame in seen if frame.valid) == 0
         assert len({contact.id for _, frame in seen for contact in frame.contacts}) == touched
-        parts = {frame.part for _, frame in seen[len(seen) // 2 :]}
-        assert min(parts) > 0 if part else parts == {0}
+        assert {raw.part for raw in host.raws[-20:]} == ({*range(1, 11)} if part else {0})
+        assert {frame.part > 0 for _, frame in seen[len(seen) // 2 :]} == {part > 0}
     assert host.pipeline.pre.baseline is baseline
     host.rig.close()
