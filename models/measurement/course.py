@@ -49,6 +49,12 @@ class TouchColumns:
     kinks: Array  # (K, n)
 
 
+def places_of(kinks: Sequence[Kinks], first: int = 0) -> list[slice]:
+    """Where each of them is among all that is solved for, from place `first` on."""
+    ends = first + np.cumsum([len(each) for each in kinks], dtype=int)
+    return [slice(end - len(each), end) for each, end in zip(kinks, ends, strict=True)]
+
+
 class TouchCourse:
     """Of one scan. times_s (K,): when each value was measured, from its middle on; span_s: how long it took."""
 
@@ -73,15 +79,13 @@ class TouchCourse:
         count, k, shaped = len(priors), len(self._times_s), len(directions) > 0
         mean, slopes = np.zeros(k), np.empty((STATES * count, k))
         shapes, bent = np.empty((SHAPES * count if shaped else 0, k)), np.empty((sum(map(len, kinks)), k))
+        among_all = places_of(kinks)
         for touch, (state, prior) in enumerate(zip(states, priors, strict=True)):
             moved = self._moved(state, prior)
             acts = self._acts(state, prior)
             strength = acts * self._actions(state)
             mean += strength * moved[0]
-            at = 0
-            for own in kinks:
-                among = slice(at, at + len(own))
-                at = among.stop
+            for own, among in zip(kinks, among_all, strict=True):
                 if own.touch == touch:
                     bent[among] = own.profiles * moved[own.bends]
                     if own.bends == STRENGTH and kinked is not None:
@@ -132,7 +136,7 @@ class TouchCourse:
         """Of each touch whether its action changes, and whether it moves, by enough to do so unevenly."""
         rise = np.abs(states[:, RATE]) * self.span_s / 2
         way = np.hypot(states[:, VX], states[:, VY]) * [self._acting(prior)[1] for prior in priors]
-        return list(zip(rise > n.CHANGES * np.abs(states[:, ACTION]), way > n.MOVES / 2, strict=True))
+        return list(zip(rise > n.CHANGES * np.abs(states[:, ACTION]), way > n.HALF_PIXEL / 2, strict=True))
 
     def _within(self, *instants_s: float) -> list[float]:
         """Those that are within the scan, or so near that a change at once then is seen in it."""
@@ -162,7 +166,7 @@ class TouchCourse:
         x, y, log_radius = state[X] + state[VX] * middle_s, state[Y] + state[VY] * middle_s, state[LOG_RADIUS]
         way = 2 * half_s * np.hypot(state[VX], state[VY])
         middle = self._response.with_slopes(x, y, log_radius)
-        if way <= max(n.MOVES, n.BENDS_BY * np.exp(log_radius)):
+        if way <= max(n.HALF_PIXEL, n.BENDS_BY * np.exp(log_radius)):
             going = middle[1:3] * self._times_s
             middle[0] += (state[[VX, VY]] @ middle[1:3]) * (self._times_s - middle_s)
             return np.concatenate([middle, going])

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from models.measurement import numbers as n
-from models.measurement.course import STRENGTH, Kinks, TouchColumns, TouchCourse
+from models.measurement.course import STRENGTH, Kinks, TouchColumns, TouchCourse, places_of
 from models.measurement.touch import (
     ACTION,
     LOG_RADIUS,
@@ -32,7 +33,7 @@ from models.measurement.touch import (
     is_disc,
     within_limits,
 )
-from models.measurement.whitening import Whitening, diagonal_of, factor
+from models.measurement.whitening import Whitening
 
 Array = NDArray[np.float64]
 
@@ -42,19 +43,7 @@ MOST_DAMPING = 1e4
 
 
 @dataclass(frozen=True)
-class KnownWhitening:
-    """Of a scan's covariance and the misfit of touches whose squared change is size2."""
-
-    white: Whitening
-    size2: float
-
-    def fits(self, size2: float) -> bool:
-        """Whether the misfit of touches of another squared change is nearly the same."""
-        return 1 / SIZE_CHANGED < size2 / self.size2 < SIZE_CHANGED
-
-
-@dataclass(frozen=True)
-class Turned:
+class OwnDirections:
     """The touches' own directions, (9, K) each, about their states (T, 7)."""
 
     states: Array
@@ -65,7 +54,7 @@ class Turned:
         if states.shape != self.states.shape:
             return False
         away = np.abs(states - self.states)
-        return not ((away[:, PLACE] > n.TURNS).any() or (away[:, LOG_RADIUS] > n.TURNS_LOG).any())
+        return not ((away[:, PLACE] > n.HALF_PIXEL).any() or (away[:, LOG_RADIUS] > n.TURNS_LOG).any())
 
 
 @dataclass(frozen=True)
@@ -92,14 +81,14 @@ class FoundTouches:
     shape_variance: Array  # (T, 9)
     chi2: float  # squared whitened residual a measurement
     evidence: float  # log
-    white: Whitening
+    white: Whitening  # of the scan's covariance and the misfit of touches whose squared change is size2
+    size2: float
     weighted_residual: Array  # (K,) S^-1 of the residual
     left: Array  # (K,) residual
     design: Array  # (K, N) whitened slopes of all that was solved for
     solved: Array  # (N, N) its posterior covariance
     steps: int
-    known: KnownWhitening
-    turned: Turned
+    own: OwnDirections
 
     def __len__(self) -> int:
         return len(self.priors)
@@ -109,7 +98,7 @@ class FoundTouches:
         columns = self.white(responses)
         along = self.design.T @ columns
         whole = np.sum(columns**2, axis=0)
-        return np.asarray(np.maximum(whole - np.sum(along * (self.solved @ along), axis=0), 0.02 * whole))
+        return np.asarray(np.maximum(whole - np.sum(along * (self.solved @ along), axis=0), n.LEAST_TOLD * whole))
 
 
 @dataclass
@@ -123,23 +112,27 @@ class _Linearisation:
     sloped: Array  # (K, N) slopes of log |Z|
     residual: Array  # whitened
     design: Array  # whitened
-    objective: float
-
-
-@dataclass(frozen=True)
-class _NormalEquations:
-    """Of one linearisation."""
-
-    measured: Array  # (N, N) of the measurements alone
+    off: Array  # (N,) from the priors' means
     precision: Array  # (N,) of the priors
-    slope: Array  # (N,) of the objective, downhill
+
+    @cached_property
+    def objective(self) -> float:
+        return float(self.residual @ self.residual + self.precision @ self.off**2)
+
+    @cached_property
+    def slope(self) -> Array:
+        """(N,) of the objective, downhill."""
+        return np.asarray(self.design.T @ self.residual - self.precision * self.off)
+
+    @cached_property
+    def _measured(self) -> Array:
+        """(N, N) normal equations of the measurements alone."""
+        return np.asarray(self.design.T @ self.design)
 
     def damped(self, damping: float) -> Array:
-        """(N, N) with the priors, the measurements' diagonal raised as Levenberg does."""
-        normal = self.measured.copy()
-        diagonal = diagonal_of(normal)
-        diagonal *= 1 + damping
-        diagonal += self.precision
+        """(N, N) normal equations, the measurements' diagonal raised as Levenberg does."""
+        normal = self._measured.copy()
+        np.fill_diagonal(normal, normal.diagonal() * (1 + damping) + self.precision)
         return normal
 
     def step(self, damping: float) -> Array:
@@ -170,39 +163,38 @@ class TouchFitter:
         """Raises ValueError where a covariance is none."""
         states = within_limits(np.stack([prior.start for prior in self._priors]))
         self._kinks = list[Kinks]()
-        rest = self._turn(states, self._mean[self._states :])
-        columns = self._columns(states)
+        rest = self._renew(states, self._mean[self._states :])
+        columns = self._columns(states, rest)
         self._whiten(states, columns)
         point = self._descend(self._linearised(states, rest, columns), most_steps)
-        changed, moved = not self._known.fits(_size2(point.columns)), self._moved(point.states)
-        rest = self._turn(point.states, point.rest) if moved else point.rest
+        changed, moved = not _same_misfit(_size2(point.columns), self._size2), self._moved(point.states)
+        rest = self._renew(point.states, point.rest) if moved else point.rest
         if changed:
             self._whiten(point.states, point.columns)
         if moved or changed:
             point = self._descend(self._linearised(point.states, rest, self._columns(point.states, rest)), most_steps)
-        if _size2(point.columns) < 1 / SIZE_CHANGED * self._known.size2:  # larger touches' misfit explains anything
+        if _size2(point.columns) < 1 / SIZE_CHANGED * self._size2:  # larger touches' misfit explains anything
             self._whiten(point.states, point.columns)
             point = self._linearised(point.states, point.rest, point.columns)
         return self._posterior(point)
 
-    def _columns(self, states: Array, rest: Array | None = None) -> TouchColumns:
-        kinked = None if rest is None else rest[self._shapes :]
-        directions = self._turned.directions if self._shaped else []
-        return self._scene.course.columns(states, self._priors, directions, self._kinks, kinked)
+    def _columns(self, states: Array, rest: Array) -> TouchColumns:
+        directions = self._own.directions if self._shaped else []
+        return self._scene.course.columns(states, self._priors, directions, self._kinks, rest[self._shapes :])
 
-    def _turn(self, states: Array, rest: Array) -> Array:
+    def _renew(self, states: Array, rest: Array) -> Array:
         """Take the touches' own directions anew, and how their courses may bend. Returns shapes and kinks as far as
         they are the same as in rest (N,), the others at their means.
         """
         scene, course, before = self._scene, self._scene.course, self._kinks
-        known = None if scene.before is None else scene.before.turned
+        known = None if scene.before is None else scene.before.own
         self._bends = course.bends(states, self._priors)
         if known is None or not known.near(states) or (self._shaped and not known.directions):
-            known = Turned(states, course.directions(states) if self._shaped else [])
-        self._turned = known
+            known = OwnDirections(states, course.directions(states) if self._shaped else [])
+        self._own = known
         self._kinks = course.kinks(states, self._priors)
         bent = dict[tuple[int, int, int], Array]()
-        for kinks, among in zip(before, _each(before, self._shapes), strict=True):
+        for kinks, among in zip(before, places_of(before, self._shapes), strict=True):
             bent[kinks.touch, kinks.bends, len(kinks)] = rest[among]
         kinked = [bent.get((k.touch, k.bends, len(k)), np.zeros(len(k))) for k in self._kinks]
         self._precisions = np.concatenate([self._precision, *map(np.ones_like, kinked)])
@@ -210,20 +202,17 @@ class TouchFitter:
 
     def _moved(self, states: Array) -> bool:
         """Whether their directions are others by now, or a course bends that was straight."""
-        if not self._turned.near(states):
-            return True
-        both = zip(self._scene.course.bends(states, self._priors), self._bends, strict=True)
-        return any((changes and not changed) or (moves and not moved) for (changes, moves), (changed, moved) in both)
+        bends = np.array(self._scene.course.bends(states, self._priors)) & ~np.array(self._bends)
+        return bool(bends.any()) or not self._own.near(states)
 
     def _descend(self, point: _Linearisation, most_steps: int) -> _Linearisation:
         """Levenberg and Marquardt's steps until they gain nothing, or what is left to go is linear."""
         damping = float(n.DAMPING)
         for _ in range(most_steps):
-            normal = self._normal(point)
-            step = normal.step(damping)
+            step = point.step(damping)
             if not np.isfinite(step).all():
                 break  # measurements of any magnitude: nothing explains them
-            if self._is_linear(point.states, linear := normal.step(0.0)) or self._hopeless(point, normal, linear):
+            if self._is_linear(point.states, linear := point.step(0.0)) or self._hopeless(point, linear):
                 break
             self.steps += 1
             tried = self._stepped(point, step)
@@ -231,29 +220,27 @@ class TouchFitter:
             if gained > 0:
                 point, damping = tried, max(damping / 3, 1e-5)
             else:
-                damping = max(damping * 10, 1e-2)
+                damping = 10 * max(damping, n.DAMPING)
             if abs(gained) < max(n.DONE, n.DONE_SHARE * point.objective) or damping > MOST_DAMPING:
                 break
         return point
 
-    def _hopeless(self, point: _Linearisation, normal: _NormalEquations, step: Array) -> bool:
+    def _hopeless(self, point: _Linearisation, step: Array) -> bool:
         """Whether the linear optimum explains nothing either. Of touches whose place is hardly known the first steps do
         not tell where they end.
         """
         if self.steps < self._tells_after:
             return False
-        return point.objective - float(normal.slope @ step) > n.HOPELESS * self._scene.live
+        return point.objective - float(point.slope @ step) > n.HOPELESS * self._scene.live
 
     def _whiten(self, states: Array, columns: TouchColumns) -> None:
         size2, scene = max(_size2(columns), n.TINY), self._scene
-        known = None if scene.before is None else scene.before.known
-        if known is not None and known.fits(size2):
-            self._known = known
+        if (before := scene.before) is not None and _same_misfit(size2, before.size2):
+            self._white, self._size2 = before.white, before.size2
             return
         covariance = scene.covariance + self._misfit**2 * size2 * scene.misfit
-        diagonal = diagonal_of(covariance)
-        diagonal += scene.course.jitter(states, self._priors) ** 2
-        self._known = KnownWhitening(Whitening.of(covariance), size2)
+        covariance[np.diag_indices_from(covariance)] += scene.course.jitter(states, self._priors) ** 2
+        self._white, self._size2 = Whitening.of(covariance), size2
 
     def _linearised(self, states: Array, rest: Array, columns: TouchColumns) -> _Linearisation:
         y, states_of = self._scene.y, columns.slopes.shape[1]
@@ -265,21 +252,11 @@ class TouchFitter:
         live = y != 0
         left[:] = np.where(live, y - np.log1p(change), 0.0)
         sloped *= np.where(live, 1 / (1 + change), 0.0)[:, None]
-        whitened = self._known.white(both)
+        whitened = self._white(both)
         residual, design = whitened[:, 0], whitened[:, 1:]
-        off = self._off(states, rest)
-        objective = float(residual @ residual + self._precisions @ off**2)
-        return _Linearisation(states, rest, columns, left, sloped, residual, design, objective)
-
-    def _off(self, states: Array, rest: Array) -> Array:
-        """From the priors' means."""
         off = np.concatenate([states.ravel(), rest])
         off[: len(self._mean)] -= self._mean
-        return off
-
-    def _normal(self, point: _Linearisation) -> _NormalEquations:
-        slope = point.design.T @ point.residual - self._precisions * self._off(point.states, point.rest)
-        return _NormalEquations(point.design.T @ point.design, self._precisions, slope)
+        return _Linearisation(states, rest, columns, left, sloped, residual, design, off, self._precisions)
 
     def _stepped(self, point: _Linearisation, step: Array) -> _Linearisation:
         """Each touch goes only so far that its disc stays near where it was."""
@@ -305,18 +282,17 @@ class TouchFitter:
         return bool((within_limits(states + step) == states + step).all())
 
     def _posterior(self, point: _Linearisation) -> FoundTouches:
-        normal = self._normal(point)
-        w, log_density = factor(normal.damped(0.0))
-        solved = w.T @ w
-        step = solved @ normal.slope
-        occam = 0.5 * (-2 * log_density - float(np.log(self._precisions).sum()))
+        normal = Whitening.of(point.damped(0.0))
+        solved = normal.w.T @ normal.w
+        step = solved @ point.slope
+        occam = -normal.log_density - 0.5 * float(np.log(self._precisions).sum())
         count = self._states
         best = point.residual - point.design @ step  # what the linear optimum would leave
         states, rest, left, residual, objective = point.states, point.rest, point.left, point.residual, point.objective
         if self._is_linear(states, step):
             states, rest = states + step[:count].reshape(-1, STATES), rest + step[count:]
             left, residual = left - point.sloped @ step, best
-            objective -= float(normal.slope @ step)
+            objective -= float(point.slope @ step)
         to_sample = self._to_sample(len(rest))
         then = states + (to_sample[:, count:] @ rest).reshape(-1, STATES)
         then[:, ACTION] = np.minimum(then[:, ACTION], MOST_ACTS)
@@ -332,21 +308,21 @@ class TouchFitter:
             shapes=outline.reshape(-1, SHAPES),
             shape_variance=unsure.reshape(-1, SHAPES),
             chi2=float(residual @ residual) / max(self._scene.live, 1),
-            evidence=self._known.white.log_density - 0.5 * objective - occam,
-            white=self._known.white,
-            weighted_residual=self._known.white.w.T @ best,
+            evidence=self._white.log_density - 0.5 * objective - occam,
+            white=self._white,
+            size2=self._size2,
+            weighted_residual=self._white.w.T @ best,
             left=left,
             design=point.design,
             solved=solved,
             steps=self.steps,
-            known=self._known,
-            turned=self._turned,
+            own=self._own,
         )
 
     def _to_sample(self, rest: int) -> Array:
         """(7 T, N) from all that was solved for to the states at the sample: kinks add to a touch's action then."""
         to_sample = np.eye(self._states, self._states + rest)
-        for kinks, among in zip(self._kinks, _each(self._kinks, len(self._mean)), strict=True):
+        for kinks, among in zip(self._kinks, places_of(self._kinks, len(self._mean)), strict=True):
             if kinks.bends == STRENGTH and self._priors[kinks.touch].until_s == np.inf:
                 at_sample = self._scene.course.at(kinks.profiles, self._scene.sample_s)
                 to_sample[STATES * kinks.touch + ACTION, among] = at_sample
@@ -357,7 +333,6 @@ def _size2(columns: TouchColumns) -> float:
     return float(columns.mean @ columns.mean)
 
 
-def _each(kinks: Sequence[Kinks], first: int) -> list[slice]:
-    """Where each of them is among all that is solved for, from place `first` on."""
-    ends = first + np.cumsum([len(each) for each in kinks], dtype=int)
-    return [slice(end - len(each), end) for each, end in zip(kinks, ends, strict=True)]
+def _same_misfit(size2: float, other: float) -> bool:
+    """Whether the misfit of touches of these squared changes is nearly the same."""
+    return 1 / SIZE_CHANGED < size2 / other < SIZE_CHANGED

@@ -150,15 +150,11 @@ class Lines:
             self.now.elsewhere += 1
             if self.now.scans and self.now.elsewhere < n.ELSEWHERE:
                 return False
-            self.now = self._begun(part)
+            columns, orders = self.columns(part), self.now.orders
+            self.now = LineState.of(len(columns), part)  # until it tells lines, what is known of such scans holds
+            self.now.columns, self.now.turn, self.now.orders = columns, np.zeros((columns.shape[1],) * 2), orders
         self.now.elsewhere = 0
         return self.now.take(left, odd, at_s, span_s) and self.now.due
-
-    def _begun(self, part: int) -> LineState:
-        """To be learnt of scans that end with this part from now on; until then what is known of them holds."""
-        columns, made = self.columns(part), LineState.of(len(self.now.columns), part)
-        made.columns, made.turn, made.orders = columns, np.zeros((columns.shape[1],) * 2), self.now.orders
-        return made
 
     def restart(self, rows: Array, part: int, white: float) -> None:
         """The same of untouched scans (n, K) that follow each other: what was known before is forgotten."""
@@ -200,7 +196,7 @@ class NoiseModel:
         for round_ in range(ROUNDS):
             white = Whitening.of(self.covariance(part))
             weighted_residual = white.solve(residuals.T).T  # (n, K) S^-1 e
-            self._follow_contacts(weighted_residual, white, 1 / 2)
+            self.learn_contacts(weighted_residual, white, 0.5)
             energy = float(np.median(weighted_residual**2 / white.conditional_precisions())) / n.MEDIAN_OF_SQUARES
             self.now.white *= min(max(energy, 0.5), 2.0)
             if round_ >= ROUNDS // 2:
@@ -224,16 +220,13 @@ class NoiseModel:
 
     def learn(self, weighted_residual: Array, white: Whitening) -> None:
         """Follow the noise of one untouched frame that was explained: weighted_residual = S^-1 y (K,)."""
-        self._follow_contacts(weighted_residual[None], white, n.LEARNING)
+        self.learn_contacts(weighted_residual, white)
         excess = self._excess(weighted_residual, white.conditional_precisions())
         steady = self._squares @ self.now.jitter < 0.2 * self.now.white
         if steady.any():
-            change = n.LEARNING_WHITE * float(excess[steady].mean())
-            self.now.white = float(np.clip(self.now.white + change, 0.8 * self.now.white, self.now.white / 0.8))
-
-    def learn_contacts(self, weighted_residual: Array, white: Whitening) -> None:
-        """Follow the contacts' noise alone, as far as a touch that is there leaves it to be seen."""
-        self._follow_contacts(weighted_residual[None], white, n.LEARNING)
+            level = self.now.white
+            followed = level + n.LEARNING_WHITE * float(excess[steady].mean())
+            self.now.white = float(np.clip(followed, n.WHITE_FALLS * level, level / n.WHITE_FALLS))
 
     def update(self, weighted_residual: Array, part: int, odd: bool, at_s: float, span_s: float) -> None:
         """Take note of what several measurements of a frame have in common beside drift and contacts: weighted_residual
@@ -247,11 +240,12 @@ class NoiseModel:
         columns = self.lines.columns(part)
         return np.asarray(self.variances() * weighted_residual + (weighted_residual @ columns) @ columns.T)
 
-    def _follow_contacts(self, weighted_residual: Array, white: Whitening, share: float) -> None:
-        """Unbiased moments: the generalised least squares estimate of a contact's change has variance v + 1 / n, with
-        n its information.
+    def learn_contacts(self, weighted_residual: Array, white: Whitening, share: float = n.LEARNING) -> None:
+        """Follow the contacts' noise alone, as far as a touch that is there leaves it to be seen; weighted_residual
+        (K,) or (n, K). Unbiased moments: the generalised least squares estimate of a contact's change has variance
+        v + 1 / n, with n its information.
         """
-        columns = white(self._contact)
+        weighted_residual, columns = np.atleast_2d(weighted_residual), white(self._contact)
         information = np.maximum((columns**2).sum(axis=0), n.TINY)
         moved = (weighted_residual @ self._contact / information) ** 2
         moved = np.minimum(moved, n.OUTLIER / information + n.OUTLIER * self.now.flicker).mean(axis=0)

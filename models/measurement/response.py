@@ -61,13 +61,15 @@ class DiscResponse:
     def directions(self, x: float, y: float, log_radius: float) -> Array:
         """(9, K) the touch's own directions, see models/measurement/touch.py."""
         at = self._covered(x, y, log_radius)
-        found = np.empty((SHAPES, self._jacobian.shape[2]))
+        from_centre = self._axis[None, at.columns] - x + 1j * (self._axis[at.rows, None] - y)
+        angles = from_centre / np.maximum(np.abs(from_centre), CLOSE)
+        waves = [angles**harmonic for harmonic in HARMONICS]  # outlines r (1 + h cos m phi) and r (1 + h sin m phi)
+        shares = [at.shares[3] * part for wave in waves for part in (wave.real, wave.imag)]
         blur = 0.5 * (n.EDGE_WIDTH / self._pixel) ** 2  # of variance w^2: w^2 / 2 times the Laplacian
-        outlines = np.stack([*self._outlines(at, x, y), blur * laplace(at.shares[0], mode="constant")])
-        found[:-2] = self._sum(self._jacobian, at, outlines)
-        found[-2] = self._sum(self._along, at, at.shares[:1])[0]
-        found[-1] = self._sum(self._turned, at, at.shares[:1])[0]
-        return found / area_of(log_radius)
+        shares.append(blur * laplace(at.shares[0], mode="constant"))
+        found = [self._sum(self._jacobian, at, np.stack(shares))]
+        found += [self._sum(table, at, at.shares[:1]) for table in (self._along, self._turned)]
+        return np.concatenate(found) / area_of(log_radius)
 
     def _covered(self, x: float, y: float, log_radius: float) -> Covered:
         radius = float(np.exp(log_radius))
@@ -87,13 +89,6 @@ class DiscResponse:
         first, last = ((centre + way + 1) / self._pixel for way in (-radius, radius))
         begin = min(max(0, int(first) - 1), len(self._axis) - 1)  # one pixel at least, also beyond the sheet
         return slice(begin, max(begin + 1, min(len(self._axis), int(last) + 2)))
-
-    def _outlines(self, at: Covered, x: float, y: float) -> list[Array]:
-        """Outlines r (1 + h cos m phi) and r (1 + h sin m phi)."""
-        from_centre = self._axis[None, at.columns] - x + 1j * (self._axis[at.rows, None] - y)
-        turned = from_centre / np.maximum(np.abs(from_centre), CLOSE)
-        waves = [turned**harmonic for harmonic in HARMONICS]
-        return [at.shares[3] * part for wave in waves for part in (wave.real, wave.imag)]
 
     def _sum(self, table: NDArray[np.float32], at: Covered, weights: Array) -> Array:
         """(c, K) of weights (c, n, m)."""
@@ -151,7 +146,9 @@ class MeasuredMap:
         self._spacing = float(arrays.spacing) / metres_per_unit
         slopes = [np.gradient(table, self._spacing, axis=axis) for axis in (1, 0)]
         self._table: Array = np.stack([table, *slopes])  # (3, rows, columns, K)
-        self.error = _of_touches(np.asarray(arrays.error, float), np.asarray(arrays.noise, float))
+        noise = np.diag(np.asarray(arrays.noise, float) ** 2)
+        values, vectors = np.linalg.eigh(np.asarray(arrays.error, float) - noise)
+        self.error: Array = vectors * np.maximum(values, 0.0) @ vectors.T  # (K, K) without negative variances
         iy, ix = np.nonzero(allowed)
         places = self._corner + self._spacing * np.column_stack([ix, iy])
         self.discs = np.column_stack([places, np.full(len(places), np.log(n.TYPICAL_RADIUS))])  # (A, 3) all of the map
@@ -210,9 +207,3 @@ class DiscGrid:
         z2 = along**2 / information
         best = int(z2.argmax())
         return float(z2[best]), best, float(along[best] / information[best])
-
-
-def _of_touches(error: Array, noise: Array) -> Array:
-    """The part of an error's covariance that is not noise, without negative variances."""
-    values, vectors = np.linalg.eigh(error - np.diag(noise**2))
-    return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T)

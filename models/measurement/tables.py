@@ -128,17 +128,17 @@ def tables_of(bundle: Bundle) -> SkinTables:
 
     Raises BundleError where a file of the bundle cannot be read.
     """
-    matrices = bundle.matrices
+    matrices, pattern = bundle.matrices, np.asarray(bundle.pattern, np.int64)
     z0, contact = np.asarray(matrices.z0, float), np.asarray(matrices.contact, float)
-    coarse = _from_pixels(matrices.jacobian)
+    side = round(matrices.jacobian.shape[1] ** 0.5)
+    coarse = np.ascontiguousarray(np.asarray(matrices.jacobian, np.float32).T.reshape(side, side, -1))
     jacobian, along, turned = coarse, np.zeros_like(coarse), np.zeros_like(coarse)
     fine = bundle.has_response and (found_by(bundle) is None or bundle.mounted_fields is not None)
     if fine:
-        jacobian, along, turned = _from_fields(bundle, z0, coarse)
-    pattern = np.asarray(bundle.pattern)
+        jacobian, along, turned = _from_fields(bundle, pattern, z0, coarse)
     self_sensing = bool((pattern[:, :2] == pattern[:, 2:]).all())
-    near = fine and self_sensing
     times = len(jacobian) // len(matrices.inside)
+    typical = float(n.TYPICAL_DROP) * area_of(float(np.log(n.TYPICAL_RADIUS)))
     values, vectors = np.linalg.eigh(matrices.gram)
     misfit = vectors * np.maximum(values, 0.0) ** n.MISFIT_POWER @ vectors.T
     return SkinTables(
@@ -151,25 +151,12 @@ def tables_of(bundle: Bundle) -> SkinTables:
         misfit=_of_trace_one(np.asarray(misfit)),
         inside=np.kron(np.asarray(matrices.inside, bool), np.ones((times, times), bool)),
         z0=z0,
-        pattern=np.asarray(bundle.pattern, np.int64),
+        pattern=pattern,
         places=np.asarray(bundle.skin["electrodes"]["centre"], float),
         predicted=tells_touches(bundle),
-        wrong=float(n.MISFIT if near else n.MISFIT_FAR),
-        map=_map_of(bundle),
+        wrong=float(n.MISFIT if fine and self_sensing else n.MISFIT_FAR),
+        map=None if bundle.locator is None else MeasuredMap(bundle.locator, bundle.metres_per_unit, typical),
     )
-
-
-def _map_of(bundle: Bundle) -> MeasuredMap | None:
-    if bundle.locator is None:
-        return None
-    typical = float(n.TYPICAL_DROP) * area_of(float(np.log(n.TYPICAL_RADIUS)))
-    return MeasuredMap(bundle.locator, bundle.metres_per_unit, typical)
-
-
-def _from_pixels(jacobian: NDArray[np.floating]) -> Single:
-    """(F, F, K) of (K, F F)."""
-    side = round(jacobian.shape[1] ** 0.5)
-    return np.ascontiguousarray(np.asarray(jacobian, np.float32).T.reshape(side, side, -1))
 
 
 def _series(bundle: Bundle, z0: Array) -> Array:
@@ -180,12 +167,13 @@ def _series(bundle: Bundle, z0: Array) -> Array:
     return np.asarray(np.where(members, series / z0[:, None], 0.0))
 
 
-def _from_fields(bundle: Bundle, z0: Array, coarse: Single) -> tuple[Single, Single, Single]:
+def _from_fields(
+    bundle: Bundle, pattern: NDArray[np.int64], z0: Array, coarse: Single
+) -> tuple[Single, Single, Single]:
     """A drop delta in a pixel changes an impedance by delta * E_drive . E_sense * area (Geselowitz 1971). coarse: the
     bundle's own Jacobian, which knows the sign of each impedance.
     """
     tables = bundle.response()
-    pattern = np.asarray(bundle.pattern, np.int64)
     fields = (tables.fields if bundle.mounted_fields is None else bundle.mounted_fields).astype(float)
     side, electrodes = round(fields.shape[1] ** 0.5), fields.shape[2]
     inside = np.kron(tables.inside, np.ones((2, 2), bool)) if side == 2 * len(tables.inside) else None

@@ -22,8 +22,12 @@ class Whitening:
 
     @classmethod
     def of(cls, covariance: Array) -> Whitening:
-        """Raises ValueError where it is no covariance."""
-        return cls(*factor(covariance))
+        """Raises ValueError where it is not positive."""
+        root, info = lapack.dpotrf(covariance.T, lower=1, clean=1)  # transposed: laid out as LAPACK takes it
+        if info:
+            raise ValueError(f"a covariance that is none: its minor {info} is not positive")
+        w, _ = lapack.dtrtri(root, lower=1, overwrite_c=1)
+        return cls(w, float(np.log(np.diag(w)).sum()))
 
     def __call__(self, values: Array) -> Array:
         """(K, ...) whitened."""
@@ -41,22 +45,6 @@ class Whitening:
     def conditional_precisions(self) -> Array:
         """(K,) of each measurement given all others: the diagonal of S^-1."""
         return np.asarray((self.w**2).sum(axis=0))
-
-
-def factor(matrix: Array) -> tuple[Array, float]:
-    """W (K, K), lower triangular, with W S W^T = 1, and the logarithm of its determinant. Raises ValueError where S is
-    not positive.
-    """
-    root, info = lapack.dpotrf(matrix.T, lower=1, clean=1)  # transposed: laid out as LAPACK takes it
-    if info:
-        raise ValueError(f"a covariance that is none: its minor {info} is not positive")
-    w, _ = lapack.dtrtri(root, lower=1, overwrite_c=1)
-    return w, float(np.log(np.diag(w)).sum())
-
-
-def diagonal_of(matrix: Array) -> Array:
-    """(K,) of (K, K), contiguous: a view, to be changed in place."""
-    return matrix.reshape(-1)[:: len(matrix) + 1]
 
 
 def leave_out(covariance: Array, live: NDArray[np.bool_]) -> None:

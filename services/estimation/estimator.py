@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement.tables import SkinTables
 from models.measurement.touch import SHAPES, STATES
@@ -15,15 +14,13 @@ from services.estimation.faults import advice
 from services.estimation.faults.wires import WireFault
 from services.estimation.hypotheses.innovation import Observation, StepBudget
 from services.estimation.initialisation.baseline import NoBaseline
-from services.estimation.initialisation.tare import AgreedScans, BaselineTells, LatestScansState, Taring, TaringState
+from services.estimation.initialisation.tare import AgreedScans, LatestScansState, Taring, TaringState
 from services.estimation.scan_step import EstimatorState, ScanStep
 from services.estimation.tared import KnownBaseline, TaredSkin, TaredState
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, Judgement, judge
 from services.estimation.values.scan import NANOSECOND, PER_S, Scan
 from services.estimation.values.state import loaded, saved
-
-Array = NDArray[np.float64]
 
 LAYOUT = 32  # of a kept state
 
@@ -51,10 +48,7 @@ class Estimator:
         """Take the latest scans for the untouched skin: these. Raises NoBaseline; force: not because of touches."""
         if not force and self.wire is not None:
             raise NoBaseline("wires of the board are wrong, expected all as they belong: mend them and try again")
-        tells = BaselineTells.NOTHING
-        if self.skin is not None:
-            tells = BaselineTells.LOST if self.now.unexplained_s > n.LOST_S else BaselineTells.TOUCHES
-        scans = self.taring.by_command(force, tells)
+        scans = self.taring.by_command(force, None if self.skin is None else self.now.unexplained_s)
         self._begin(scans)
         return scans
 

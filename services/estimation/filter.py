@@ -10,15 +10,13 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from models.measurement.fit import FoundTouches
 from models.measurement.tables import FIELD_DEGREES, SkinTables
 from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
+from services.estimation.values.arrays import Array, Indices
 
 MODES = len(FIELD_DEGREES)
 FIELD, RATES = slice(0, MODES), slice(MODES, 2 * MODES)
@@ -131,14 +129,11 @@ class SkinFilter:
         p, passed_s = self.now.p, self._passed_s(at_s)
         return float(p[0, 0] + 2 * passed_s * p[0, MODES] + passed_s**2 * p[MODES, MODES])
 
-    def inflated_process_noise(self, times: float = 1.0) -> Array:
+    def inflated_process_noise(self, times: float) -> Array:
         """(K, K) covariance of drift faster than the filter's own; times: that variance, beyond 1 contacts move too."""
         columns = self._tables.field
-        covariance = np.asarray(times * (columns * self._faster) @ columns.T)
-        if times > 1:
-            contact = self._tables.contact * n.CONTACT_FASTER
-            covariance += (times - 1) * contact @ contact.T
-        return covariance
+        contact = self._tables.contact * n.CONTACT_FASTER
+        return np.asarray(times * (columns * self._faster) @ columns.T + (times - 1) * contact @ contact.T)
 
     def widen(self, times: float) -> None:
         """It drifts faster than it did: by what `faster` says, of which a share stays."""
@@ -191,8 +186,6 @@ class SkinFilter:
         `more_memory`. What one place remembers of several touches is no more than it may of the strongest.
         """
         memories = self.now.memories
-        if not memories:
-            return True
         most = np.array([n.MEMORY_MOST * memory.action for memory in memories])
         states = self.now.x[self._fixed :].reshape(len(memories), STATES_OF_MEMORY)
         own = [self._own(place) for place in range(len(memories))]
@@ -253,8 +246,6 @@ class SkinFilter:
 
     def _moved(self, passed_s: float, flicker: Array) -> tuple[Array, Array]:
         x, p = self._moved_mean(passed_s), self.now.p.copy()
-        if not passed_s:
-            return x, p
         p[FIELD] += passed_s * p[RATES]
         p[:, FIELD] += passed_s * p[:, RATES]
         modes = np.arange(MODES)
@@ -264,16 +255,15 @@ class SkinFilter:
         grown[FIELD] = self._value_walk * passed_s + self._rate_walk * passed_s**3 / 3
         grown[RATES] = self._rate_walk * passed_s
         grown[self.contacts] = (n.CONTACT_WALK**2 + n.CONTACT_FOLLOWS * flicker) * passed_s
-        if count := len(self.now.memories):
-            fade = np.tile(np.exp(-passed_s / FADES_S), count)
-            memories = slice(self._fixed, None)
-            p[memories] *= fade[:, None]
-            p[:, memories] *= fade
-            grown[memories] = (n.MEMORY_WALK * x[memories]) ** 2 * passed_s / np.tile(FADES_S, count)
+        memories, fades_s = slice(self._fixed, None), np.tile(FADES_S, len(self.now.memories))
+        fade = np.exp(-passed_s / fades_s)
+        p[memories] *= fade[:, None]
+        p[:, memories] *= fade
+        grown[memories] = (n.MEMORY_WALK * x[memories]) ** 2 * passed_s / fades_s
         p[np.diag_indices_from(p)] += grown
         return x, p
 
-    def _columns(self) -> tuple[Array, NDArray[np.intp]]:
+    def _columns(self) -> tuple[Array, Indices]:
         """(K, S) of the states that are seen, and (S,) their places."""
         if not self.now.memories:
             return self._lasting, self._lasting_seen

@@ -6,7 +6,6 @@ from copy import copy, deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement.fit import FoundTouches
 from models.measurement.noise import NoiseModel
@@ -16,8 +15,7 @@ from services.estimation.filter import FilterState, SkinFilter
 from services.estimation.hypotheses.detector import newest_z2
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
+from services.estimation.values.arrays import Array, Single
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,7 @@ class NullGate:
         found = self._steady.get(self._noise.alike(measured.scan.part))
         return found if found is not None and found.ids == ids and _lately(found.at_s, measured) else None
 
-    def look(self, measured: Observation, y: Array, information: NDArray[np.float32]) -> Seen | None:
+    def look(self, measured: Observation, y: Array, information: Single) -> Seen | None:
         """y (K,): over the prediction, or 0. None: no whitening, or one that would overlook a step of the gain."""
         known = self._glances.get(self._noise.alike(measured.scan.part))
         if known is None or not _lately(known.at_s, measured):

@@ -8,15 +8,14 @@ from functools import cache
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.bundle import Bundle
 from models.measurement.numbers import TINY
 from models.prereconstruction import Drift, Operator, PreReconstructor
+from services.estimation.values.arrays import Array, Mask, Single
 from services.estimation.values.numbers import LEAST_LIVE
 from services.estimation.values.state import loaded
 
-Array = NDArray[np.float64]
 Key = TypeVar("Key")
 Made = TypeVar("Made")
 
@@ -29,7 +28,7 @@ DRIFTS_S = 0.25  # of the drift that skin.toml allows: what is left of it beside
 FEWEST = 2  # finite measurements without which there is nothing to reconstruct
 
 
-def sigma_of_mean(sigma: NDArray[np.float32], n: int) -> NDArray[np.float32]:
+def sigma_of_mean(sigma: Single, n: int) -> Single:
     """Of the mean of n frames, of `sigma` (K,) each: to the last bit what the frames of a touch that is held state."""
     return np.asarray(sigma / np.sqrt(n), np.float32)
 
@@ -51,19 +50,19 @@ class Operators:
         self._pre, self._drift = pre, Drift(scale_per_s * DRIFTS_S, contact_per_s * DRIFTS_S)
         self._made: dict[tuple[bytes, int, int], Operator | None] = {}
 
-    def __call__(self, sigma: NDArray[np.float32], averaged: int, tare_frames: int) -> Operator | None:
+    def __call__(self, sigma: Single, averaged: int, tare_frames: int) -> Operator | None:
         """For the mean of so many scans, whose standard deviation is sigma (K,), infinite where a measurement does not
         count, against the mean of `tare_frames`. None where too few count.
         """
         key = sigma.tobytes(), averaged, tare_frames
         return cached(self._made, key, lambda: self._make(sigma.astype(float), averaged, tare_frames))
 
-    def prepare(self, sigma: NDArray[np.float32], averaged: int, tare_frames: int) -> bool:
+    def prepare(self, sigma: Single, averaged: int, tare_frames: int) -> bool:
         """Make that one; False: it is there, or there is none."""
         there = (sigma.tobytes(), averaged, tare_frames) in self._made
         return not there and self(sigma, averaged, tare_frames) is not None
 
-    def _make(self, sigma: NDArray[np.float64], averaged: int, tare_frames: int) -> Operator | None:
+    def _make(self, sigma: Array, averaged: int, tare_frames: int) -> Operator | None:
         live = np.isfinite(sigma)
         if live.sum() < FEWEST:
             return None
@@ -89,7 +88,7 @@ class Reconstructed(NamedTuple):
 class HeldTouch:
     """All that changes of how one touch is reconstructed."""
 
-    live: Annotated[NDArray[np.bool_] | None, "K"] = None  # measurements that count in the mean
+    live: Annotated[Mask | None, "K"] = None  # measurements that count in the mean
     reference: Annotated[Array | None, "K"] = None  # the difference last reconstructed
     averaged: int = 0  # frames in it
     recent: list[Annotated[Array, "K"]] = field(default_factory=list)  # the newest frames since it last changed
@@ -113,14 +112,13 @@ class Reconstruction:
     def begin(self, sigma: Array, frames: int) -> None:
         """Another baseline, the mean of so many frames; sigma (K,): noise of the difference to it."""
         self.sigma, self.frames = sigma, frames
-        self._limit: tuple[Operator, float] | None = None  # of a change's score, by this operator
         self.reset()
 
     def reset(self) -> None:
         """Nothing touches."""
         self.now = HeldTouch()
 
-    def __call__(self, d: Array, sigma: NDArray[np.float32], scan: int) -> Reconstructed | None:
+    def __call__(self, d: Array, sigma: Single, scan: int) -> Reconstructed | None:
         """Of a scan's difference and its standard deviation (K,), infinite where a measurement does not count. None:
         nothing changed, the image last made is held, or too few count for one.
         """
@@ -128,16 +126,13 @@ class Reconstruction:
         if operator is None:
             self.reset()
             return None
-        if self._limit is None or self._limit[0] is not operator:
-            self._limit = operator, operator.threshold(CHANGED, self.frames)
         live = np.isfinite(sigma)
         if self.now.live is None or (live != self.now.live).any():  # frames of other measurements make another image
-            self.reset()
+            self.now = HeldTouch(live)
         now = self.now
-        now.live = live
         if now.reference is not None:
             variance = 1 + 1 / now.averaged  # of the change, in units of one frame's
-            if operator.score(d - now.reference) > variance * self._limit[1]:
+            if operator.score(d - now.reference) > variance * operator.threshold(CHANGED, self.frames):
                 now.recent, now.count = [], 0
         now.recent = [*now.recent[1 - LONGEST_MEAN :], d]
         now.count += 1
@@ -169,15 +164,13 @@ REFUSED_FAINT = 0.15  # of a faint touch noise hides what the image gets wrong, 
 class Conditioned(NamedTuple):
     """For one noise of the frames."""
 
-    whiten: NDArray[np.float32]  # (K, K)
-    forward: NDArray[np.float32]  # (K, h * w), whitened
+    whiten: Single  # (K, K)
+    forward: Single  # (K, h * w), whitened
     noise: float  # the energy that noise may leave
 
 
 class Residual:
-    """For one bundle and image size. Conditioned once for each noise that frames come with: those of a touch that is
-    held are means of 1, 2, 4, 8 or 16.
-    """
+    """For one bundle and image size. Conditioned once for each noise of frames: those of a held touch are of MEANS."""
 
     def __init__(self, bundle: Bundle, to_scale: bool) -> None:
         """to_scale: images are in S/m; else only their form counts, not their size."""
@@ -186,9 +179,7 @@ class Residual:
         self.refused = False  # whether the last image that was given a share is of no touch
         self._known: dict[bytes, Conditioned | None] = {}
 
-    def __call__(
-        self, difference: NDArray[np.float32], sigma: NDArray[np.float32], image: NDArray[np.float32]
-    ) -> float | None:
+    def __call__(self, difference: Single, sigma: Single, image: Single) -> float | None:
         """(K,) difference and its standard deviation (infinite: not used), drop (n, n) [S/m] -> the share not
         explained: 0 up to 1, or beyond where the image makes it worse; None where it cannot be told.
         """
@@ -199,9 +190,7 @@ class Residual:
             return None
         y = np.clip(image, np.float32(0.0), np.float32(MOST_DROP))
         if self.to_scale:
-            np.subtract(np.float32(1.0), y, out=y)
-            np.log(y, out=y)
-            np.negative(y, out=y)
+            y = -np.log(1 - y)
         down, across = _means(h, w, *image.shape)
         coarse = (down @ y @ across).ravel()
         seen, expected = known.whiten @ difference, known.forward @ coarse
@@ -214,10 +203,8 @@ class Residual:
         self.refused = not share <= (REFUSED if energy > FAINT * known.noise else REFUSED_FAINT)
         return share if np.isfinite(share) else None
 
-    def prepare(self, sigma: NDArray[np.float32]) -> bool:
-        """Condition for one of the noises of a touch whose single frames have this one (K,); False where none is left
-        to do. The first image of a touch would wait for it, 10 ms and more.
-        """
+    def prepare(self, sigma: Single) -> bool:
+        """Condition (10 ms) for one noise of a touch whose single frames have this one (K,); False: none is left."""
         if len(sigma) != self.pre.measurements:
             return False
         for n in MEANS:
@@ -227,10 +214,10 @@ class Residual:
                 return True
         return False
 
-    def _conditioned(self, sigma: NDArray[np.float32]) -> Conditioned | None:
+    def _conditioned(self, sigma: Single) -> Conditioned | None:
         return cached(self._known, sigma.tobytes(), lambda: self._condition(sigma))
 
-    def _condition(self, sigma: NDArray[np.float32]) -> Conditioned | None:
+    def _condition(self, sigma: Single) -> Conditioned | None:
         """None where too few measurements count."""
         live = np.isfinite(sigma)
         if live.mean() < LEAST_LIVE:
@@ -245,7 +232,7 @@ class Residual:
 
 
 @cache
-def _means(h: int, w: int, rows: int, columns: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _means(h: int, w: int, rows: int, columns: int) -> tuple[Single, Single]:
     """(h, rows) and (columns, w): the mean over the pixels of each coarse one (a product is faster than `mean`)."""
     down = np.repeat(np.eye(h, dtype=np.float32), rows // h, axis=1) * np.float32(h / rows)
     across = np.repeat(np.eye(w, dtype=np.float32), columns // w, axis=0) * np.float32(w / columns)

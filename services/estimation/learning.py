@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement.noise import NoiseModel
 from models.measurement.whitening import Whitening, leave_out
 from services.estimation.filter import Memory, SkinFilter
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
+from services.estimation.values.arrays import Array, Mask
 
 
 @dataclass(frozen=True)
@@ -24,7 +22,7 @@ class PendingScan:
 
     at_s: float
     over: Annotated[Array, "K"]  # log |Z| over the baseline
-    live: Annotated[NDArray[np.bool_], "K"]
+    live: Annotated[Mask, "K"]
     part: int
     drifts: float  # times faster drift; 0: as slowly as before
 
@@ -50,10 +48,9 @@ class DelayedUpdate:
 
     def catch_up(self) -> None:
         """Takes longer than a look at a quiet scan: what is said of a scan does not wait for it."""
-        if len(self.now) > n.LAG_SCANS:
-            self._update(self.now.pop(0))
-
-    def _update(self, scan: PendingScan) -> None:
+        if len(self.now) <= n.LAG_SCANS:
+            return
+        scan = self.now.pop(0)
         if scan.drifts:
             self._drift.widen(scan.drifts)
         predicted = self._drift.predict(scan.at_s, self._noise.now.flicker)
@@ -92,7 +89,5 @@ class UnexplainedLoad:
     def explained(self, at_s: float) -> list[Memory]:
         """Scans are explained from at_s on: what whatever pressed before may have left. What was short was followed."""
         column, seconds = self.now.column, self.now.seconds
-        if not seconds:
-            return []
         self.now = RefusedState(np.zeros(len(column)))
         return [Memory(column, 1.0, at_s, 0.0, 0.0, 0.0, mixed=True)] if seconds > n.CHANGING_S else []

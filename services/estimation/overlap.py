@@ -9,12 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, X, Y
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
+from services.estimation.values.arrays import Array
 
 
 @dataclass

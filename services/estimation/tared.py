@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement.noise import LineState, NoiseModel, NoiseState
 from models.measurement.tables import SkinTables
@@ -22,15 +21,14 @@ from services.estimation.initialisation.tare import AgreedScans
 from services.estimation.learning import DelayedUpdate, PendingScan, RefusedState, UnexplainedLoad
 from services.estimation.touches import TouchesState, TouchTracks
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
+from services.estimation.values.arrays import Array, Mask, Single
 
 
 class KnownBaseline(NamedTuple):
     """Of this skin."""
 
     log_z0: Annotated[Array, "K"]
-    live: Annotated[NDArray[np.bool_], "K"]  # what of it counts
+    live: Annotated[Mask, "K"]  # what of it counts
     scatter: Annotated[Array, "K"]  # of log |Z| from scan to scan
     frames: int  # that it is the mean of
     doubt: str = ""  # why the skin may have been touched, for a person
@@ -48,9 +46,9 @@ class KnownBaseline(NamedTuple):
 class GridInformation(NamedTuple):
     """Of the grid's discs, made now and then and under other wires or measurements."""
 
-    each: NDArray[np.float32]  # (A,)
+    each: Single  # (A,)
     wholes: int  # EstimatorState.wholes then
-    live: NDArray[np.bool_]
+    live: Mask
     wire: WireFault | None
 
 

@@ -130,7 +130,7 @@ def test_a_fit_that_is_linear_has_the_posterior_and_the_evidence_of_linear_algeb
     design = np.hstack([at.slopes, at.shapes])
     y = np.log1p(at.mean + design @ truth) + 1e-4 * rng.standard_normal(120)
     found = TouchFitter(FittedScan(y, covariance, course, np.eye(120) / 120, 120), [prior], 0.0).fit(10)
-    there = course.columns(found.states, [prior], found.turned.directions)  # all of it linearised where it ends
+    there = course.columns(found.states, [prior], found.own.directions)  # all of it linearised where it ends
     moved = np.concatenate([found.states[0] - state, found.shapes[0] - prior.shape])
     design = np.hstack([there.slopes, there.shapes])
     at_best = there.mean + there.shapes @ found.shapes[0]
@@ -162,7 +162,7 @@ def test_a_touchs_misfit_and_values_that_do_not_count_make_it_less_sure() -> Non
     scan = FittedScan(y, 1e-8 * np.eye(120), course, np.eye(120) / 120, 120)
     sure, unsure = TouchFitter(scan, [prior], 0.0).fit(10), TouchFitter(scan, [prior], 0.5).fit(10)
     added = np.linalg.inv(unsure.white.w.T @ unsure.white.w) - 1e-8 * np.eye(120)
-    assert_allclose(np.diag(added), 0.5**2 * unsure.known.size2 / 120, rtol=1e-3)
+    assert_allclose(np.diag(added), 0.5**2 * unsure.size2 / 120, rtol=1e-3)
     assert (np.diag(unsure.covariance)[PLACE] > 2 * np.diag(sure.covariance)[PLACE]).all()
     white = TouchFitter(scan, [replace(prior, until_s=0.01)], 0.0).fit(10).white.w  # it may end a little later
     added = np.diag(np.linalg.inv(white.T @ white)) - 1e-8

@@ -16,7 +16,7 @@ from protocol.frames import STATUS_CLIPPED, STATUS_FIFO, STATUS_RTIA, Judgements
 from services.describe import EVERY_S, MOVED
 from services.estimation.faults import advice
 from services.estimation.initialisation.baseline import Baseline, NoBaseline, agreement, take
-from services.estimation.initialisation.start import JudgedStart, StartSays, TouchAtStartTest
+from services.estimation.initialisation.start import JudgedStart, StartSays, judge_start
 from services.estimation.initialisation.tare import without_drift
 from services.preprocessing import Preprocessing
 from services.runtime.config import Skin, TareConfig
@@ -411,8 +411,7 @@ def solved(*shapes: Shape, background: float = 1.0, contact: Array | float = 1.0
 def judged(z: Array, rng: np.random.Generator) -> JudgedStart:
     sigma = NOISE / np.sqrt(SCANS)
     mean = np.log(z) + sigma * rng.standard_normal(len(z))
-    judge = TouchAtStartTest(tables_of(Bundle.load("square16")))
-    return judge(mean, np.full(len(z), sigma**2), np.ones(len(z), bool), None)
+    return judge_start(tables_of(Bundle.load("square16")), mean, np.full(len(z), sigma**2), np.ones(len(z), bool), None)
 
 
 def any_skin(rng: np.random.Generator) -> dict[str, Array | float]:

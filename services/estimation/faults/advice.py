@@ -38,23 +38,21 @@ def states_of(
     electrodes: int, wire: WireFault | None, opens: tuple[int, ...], contact: int, silent: bool
 ) -> NDArray[np.uint8]:
     """(E,) of the wire format. contact: electrode whose impedance is changed; -1: none. silent: none answers."""
-    states = np.full(electrodes, STUCK if silent else OK, np.uint8)
-    if silent:
-        return states
+    states = np.full(electrodes, OK, np.uint8)
     if contact >= 0:
         states[contact] = DRIFTING
     states[list(opens)] = OPEN
     if wire is not None:
         states[list(wire.electrodes)] = STATE_OF[wire.kind]
+    if silent:
+        states[:] = STUCK
     return states
 
 
 def judgements_of(
     states: NDArray[np.uint8], status: NDArray[np.uint8], failed: float, undecided: bool
 ) -> list[Judgement]:
-    """Of electrodes' states (E,), status bits (K,) and the share of measurements that failed. undecided: a contact that
-    changed may be a touch.
-    """
+    """Of states (E,), status bits (K,) and the share that failed. undecided: a contact that changed may be a touch."""
     found = [judge("silent", failed, n.SILENT)]
     for state, row in ROW_OF.items():
         named = np.flatnonzero(states == state)

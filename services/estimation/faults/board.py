@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from models.measurement.fit import LEAST_MEAN, FoundTouches
+from models.measurement.fit import LEAST_MEAN
 from models.measurement.noise import NoiseModel
 from models.measurement.numbers import SCAN_S
 from models.measurement.tables import SkinTables
@@ -22,14 +22,13 @@ from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, RATE, STATES, VE
 from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice, wires
 from services.estimation.faults.contact_state import JUMP, ContactState
-from services.estimation.faults.impedance import MOST_LOG, Change, ContactColumns, Unexplained, gain_change, gain_onset
+from services.estimation.faults.impedance import MOST_LOG, Change, ContactColumns, Unexplained, gain_changes
 from services.estimation.faults.wires import BoardScan, WireFault, WireKind, WireMaps
 from services.estimation.filter import Prediction
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
+from services.estimation.values.arrays import Array, Mask
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Ask = Callable[[Innovation, Change, bool], ScoredAnswer]
 
 
@@ -72,7 +71,6 @@ class BoardView:
     at: Observation
     predicted: Prediction
     untouched: Array  # (K,) log |Z| as the filter predicts it
-    log_z: Array  # (K,) 0 where it failed
     sound: Array  # (K,) what a board with sound wires would show, untouched
     failed: Mask
     live: Mask
@@ -89,7 +87,7 @@ class BoardView:
     @property
     def y(self) -> Array:
         """(K,) log |Z| over what is predicted without touches."""
-        left = self.log_z - self.shown
+        left = self.at.log_z - self.shown
         if self.apart:
             left = np.log1p(np.maximum(np.expm1(np.minimum(left, MOST_LOG)) - self.mean, LEAST_MEAN))
         return np.where(self.live, left, 0.0)
@@ -165,15 +163,12 @@ class BoardFaults:
 
     def look(self, at: Observation, predicted: Prediction, untouched: Array, lifted: tuple[int, ...]) -> BoardView:
         """untouched (K,): log |Z| as the filter predicts it; lifted: of open electrodes those that are off the skin."""
-        now, values = self.now, at.scan.values
-        at_s = at.middle_s + at.times_s
+        now, at_s = self.now, at.middle_s + at.times_s
         sound = untouched + np.where(at_s >= now.gain_since_s, now.log_gain, now.log_gain_before)
         mean, spread = self._contacts(at_s, 2 * at.times_s / at.span_s)
-        readable = np.isfinite(values) & (values > 0) & (at.scan.status == 0)
-        log_z = np.log(np.where(readable, values, 1.0))
         shown, slopes, apart = sound, None, True
         if now.wire is None:
-            failed = dead = self._known & (~readable | (np.abs(log_z - sound - np.log1p(mean)) > np.log(n.FAR)))
+            failed = dead = self._known & (~at.live | (np.abs(at.log_z - sound - np.log1p(mean)) > MOST_LOG))
             silent = bool(failed.mean() >= n.SILENT)
             opens = () if silent else wires.open_electrodes(failed, self.member)
             lifted = tuple(k for k in lifted if k in opens)
@@ -182,13 +177,13 @@ class BoardFaults:
         else:
             apart = self.exchanged  # each measurement is another's then, its contacts as well
             found = self.maps.one(now.wire, np.exp(sound if apart else sound + np.log1p(mean)))
-            failed, dead = self._known & ~readable, ~readable | found.blind
+            failed, dead = self._known & ~at.live, found.blind
             shown, slopes = np.log(np.maximum(found.values, n.TINY)), found.slopes
             if apart:
                 mean, spread = found.slopes @ mean, found.slopes @ spread
             opens, lifted, silent = (), (), False  # what fails is left out: a wire that is wrong may be why
         dead = dead | (at_s < now.wire_since_s)  # measured by wires that were otherwise
-        live = self._known & ~dead & ~self.member[:, list(opens)].any(axis=1)
+        live = at.live & ~dead & ~self.member[:, list(opens)].any(axis=1)
         return BoardView(
             at=at,
             predicted=predicted,
@@ -196,7 +191,6 @@ class BoardFaults:
             opens=opens,
             lifted=lifted,
             silent=silent,
-            log_z=log_z,
             sound=sound,
             failed=failed,
             live=live,
@@ -227,9 +221,7 @@ class BoardFaults:
         return view.failed.mean() < n.SILENT and self.maps.suspicious(self._wire_scan(view), self.now.wire)
 
     def wires_changed(self, view: BoardView, touched: Array, skin: Array, own: Array) -> bool:
-        """Whether the wires are otherwise than they were. touched (K,): relative change by touches that stand; skin and
-        own as for `covariance`.
-        """
+        """Whether they changed. touched (K,): relative change by touches that stand; skin, own: as for `covariance`."""
         now, untouched = self.now, self._wire_scan(view)
         scan = replace(untouched, predicted=untouched.predicted + np.log1p(touched))
         found = self.maps.guesses(scan, now.wire, skin + self._any_touch, own)
@@ -248,14 +240,13 @@ class BoardFaults:
         white = Whitening.of(covariance + self._any_touch)
         y = np.where(view.live, view.y - np.log1p(touched), 0.0)
         scan = Unexplained(y, np.ones_like(y), view.live, view.at.times_s, view.at.span_s, white)
-        since = -np.inf, gain_onset(scan)
-        return float(n.LOG_PRIOR_GAIN) + max(gain_change(scan, since_s).score for since_s in since)
+        return max(change.score + change.log_prior for change in gain_changes(scan))
 
     def _wire_scan(self, view: BoardView) -> BoardScan:
         """As the wires are asked about it: what open electrodes explain tells nothing of the others' wires."""
         opens = wires.open_electrodes(view.failed, self.member)
         known = self._known & ~self.member[:, list(opens)].any(axis=1)
-        return BoardScan(view.log_z, view.sound + np.log1p(view.mean), view.failed & known, known, view.at.times_s)
+        return BoardScan(view.at.log_z, view.sound + np.log1p(view.mean), view.failed & known, known, view.at.times_s)
 
     # --- contact impedances and gain ---
 
@@ -359,16 +350,16 @@ class BoardFaults:
         return np.asarray(self._distances(state) - np.exp(state[LOG_RADIUS]))
 
     def may_be_contacts(self, answer: ScoredAnswer, electrodes: slice = slice(None)) -> list[int]:
-        """New touches of an answer that a changed contact impedance, of one of these, may look like."""
-        fit = answer.fit
-        new = [] if fit is None else [k for k, place in enumerate(answer.association) if place < 0]
-        return [k for k in new if fit is not None and self._may_be_a_contact(fit, k, electrodes)]
-
-    def _may_be_a_contact(self, fit: FoundTouches, k: int, electrodes: slice) -> bool:
-        """Whether a touch that was found is so near an electrode that its contact impedance may look like it."""
-        variance = fit.covariance[STATES * k : STATES * k + 2, STATES * k : STATES * k + 2]
-        unsure = n.SIGMAS * float(np.sqrt(max(np.trace(variance), 0.0)))
-        return bool((self._gaps(fit.states[k])[electrodes] < n.ON_ELECTRODE + unsure).any())
+        """New touches of an answer so near one of these electrodes that its contact impedance may look like them."""
+        found = list[int]()
+        for k, place in enumerate(answer.association):
+            if place >= 0 or answer.fit is None:
+                continue
+            variance = np.diag(answer.fit.covariance)[STATES * k :][PLACE].sum()
+            near = n.ON_ELECTRODE + n.SIGMAS * float(np.sqrt(max(variance, 0.0)))
+            if (self._gaps(answer.fit.states[k])[electrodes] < near).any():
+                found.append(k)
+        return found
 
     def _likeliest_changes(
         self, without: Explanation, columns: ContactColumns, touched: Array, nearby: Array
@@ -383,7 +374,7 @@ class BoardFaults:
             tried.insert(0, (np.zeros_like(touched), np.zeros_like(nearby), float(n.MOST)))
         for touched, more, most_chi2 in tried:
             y = np.where(innovation.live, innovation.y - np.log1p(touched), 0.0)
-            white = Whitening.of(innovation.covariance + more)
+            white = Whitening.of(innovation.covariance + more) if more.any() else innovation.white
             scan = Unexplained(y, 1 / (1 + touched), innovation.live, innovation.times_s, innovation.span_s, white)
             best = max(self._changes(scan, columns), key=lambda change: change.score + change.log_prior)
             if (not best.is_gain and abs(best.size) > n.CONTACT_MOST) or scan.since(best.since_s).sum() < n.CHANGE_ROWS:
@@ -392,11 +383,11 @@ class BoardFaults:
             if likelier and best.electrode not in [change.electrode for change in found]:
                 found.append(best)
         if unexplained and len(found) < 2 and not any(change.is_gain for change in found):
-            found.append(gain_change(scan, -np.inf))
+            found += gain_changes(scan)[:1]
         return found
 
     def _changes(self, scan: Unexplained, columns: ContactColumns) -> list[Change]:
-        gains = [gain_change(scan, -np.inf), gain_change(scan, gain_onset(scan))]
+        gains = gain_changes(scan)
         found = [gain for gain in gains if abs(gain.size) > n.GAIN_LEAST]
         if not self._predicted:
             return found or gains[:1]
@@ -456,7 +447,7 @@ class BoardFaults:
             now.doubt.change(before, now.size)
         elif self._impedance < 1 - n.CONTACT_STILL and 0 < before - now.size < n.TARE_JUMPS:  # as no touch makes it
             self._note_jump(before - now.size)
-        now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
+        now.variance = 2**2 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
         now.still_s, now.still_size, now.back_scans = 0.0, now.size, 0
 
     def _note_gross(self, since_s: float) -> None:

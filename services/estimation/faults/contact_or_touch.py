@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement.fit import LEAST_MEAN, FoundTouches
 from models.measurement.tables import SkinTables
@@ -23,8 +22,7 @@ from services.estimation.faults.impedance import Change, Unexplained
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import AS_IT_IS, MEMORY, Innovation, ScoredAnswer, StepBudget
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
+from services.estimation.values.arrays import Array
 
 EVERY = 16  # scans from asking to asking, once those since the change have doubled so often: at 2, 4, 8, 16, 32, 48 ...
 SETTLES = 3  # whole scans in which a change may go on
@@ -44,12 +42,11 @@ class ContactOrTouchTest:
         doubt = faults.doubt
         if not doubt.undecided or found.answer.cause not in (AS_IT_IS, MEMORY) or self._changes(view):
             return None
-        doubt.add(self._over(view, found.answer))
+        mean = doubt.add(self._over(view, found.answer))
         if doubt.scans == 1 or (doubt.scans % EVERY and doubt.scans & (doubt.scans - 1)):
             return None
-        assert doubt.over is not None
-        y = np.where(view.live, doubt.over / doubt.scans, 0.0)
-        scale = np.exp(np.where(view.live, view.log_z - view.sound - y, 0.0))
+        y = np.where(view.live, mean, 0.0)
+        scale = np.exp(np.where(view.live, view.at.log_z - view.sound - y, 0.0))
         covariance = (skin + own / doubt.scans) * scale[:, None] * scale
         leave_out(covariance, view.live)
         asked = replace(found.innovation, y=y, covariance=covariance, budget=StepBudget(n.MOST_STEPS), keeps=0.0)
@@ -71,9 +68,7 @@ class ContactOrTouchTest:
         return None
 
     def _changes(self, view: BoardView) -> bool:
-        """Whether it goes on changing: a mean over such scans is neither a contact's nor a touch's. Asked of the first
-        scans: a finger on an electrode may never be still.
-        """
+        """Whether it goes on changing: no mean tells then. Asked of the first scans: a finger may never be still."""
         doubt = self._faults.now.doubt
         if self._faults.began_within(view):
             return True
@@ -81,9 +76,7 @@ class ContactOrTouchTest:
         return doubt.seen <= SETTLES and len(sizes) == 2 and abs(sizes[1] - sizes[0]) > doubt.least
 
     def _jumped(self, asked: Innovation, contact: Change) -> bool:
-        """Whether all of the change came from one scan to the next, and stays as it came: a press rises, or is lighter
-        than what the skin shows.
-        """
+        """Whether all of it came from one scan to the next, and stays: a press rises, or is too light to be seen."""
         faults = self._faults.now
         if faults.earlier is None or faults.doubt.seen < 2:
             return False
@@ -98,7 +91,7 @@ class ContactOrTouchTest:
         faults = self._faults
         known = faults.columns.settled_mean() + faults.columns.mean(faults.now.contact, faults.now.doubt.decided)
         touched = np.exp(view.y) - np.exp(answer.residual)
-        left = np.expm1(np.minimum(view.log_z - view.sound, n.MISFIT_MOST)) - touched - known
+        left = np.expm1(np.minimum(view.at.log_z - view.sound, n.MISFIT_MOST)) - touched - known
         return np.where(view.live, np.log1p(np.maximum(left, LEAST_MEAN)), 0.0)
 
     def _contact(self, asked: Innovation) -> Change:

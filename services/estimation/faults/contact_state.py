@@ -6,11 +6,9 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
+from services.estimation.values.arrays import Array
 
 JUMP = 0.3  # of a change that jumped: so much at most was there before, or came later; a press that takes six scans and
 # more has more of both, chosen on presses of 0.1 N on electrodes that take 1 to 20 scans
@@ -100,7 +98,7 @@ class ContactState:
             return False
         sizes = np.array([each.size for each in self.sizes])
         sd = float(sizes.std()) / np.sqrt(len(sizes))
-        return bool(abs(float(sizes.mean()) - home) < n.CONTACT_BACK + 3 * sd)
+        return bool(abs(float(sizes.mean()) - home) < n.CONTACT_BACK + n.SIGMAS * sd)
 
     def _pace(self, lasts_s: float) -> float:
         """At which it moved on steadily for so long, longer than a touch takes to come; 0: it did not [1/s]."""
@@ -115,7 +113,8 @@ class ContactState:
         off = np.abs(sizes / way - times / times[-1]).max()
         return abs(way) / float(times[-1]) if off < n.PACE_BENDS else 0.0
 
-    def add(self, over: Array) -> None:
-        """One more scan of the change that nobody knows."""
+    def add(self, over: Array) -> Array:
+        """(K,) mean of the scans of the change that nobody knows, with one more."""
         self.over = over if self.over is None else self.over + over
         self.scans += 1
+        return self.over / self.scans

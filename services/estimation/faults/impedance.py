@@ -15,16 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement.fit import LEAST_MEAN
 from models.measurement.numbers import SUDDEN_SD
 from models.measurement.tables import SkinTables
 from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from services.estimation.values.arrays import Array, Indices, Mask
 
 STEPS = 3
 MOST_LOG = float(np.log(n.FAR))  # of an impedance over its prediction: beyond, nothing is told any more
@@ -58,7 +55,7 @@ class Unexplained:
 
     y: Array  # (K,) log |Z| over what is predicted, touches that stand included; 0 where a measurement does not count
     share: Array  # (K,) of the prediction that is the untouched skin: 1 / (1 + touches)
-    live: NDArray[np.bool_]
+    live: Mask
     times_s: Array  # (K,) from the middle of the scan
     span_s: float
     white: Whitening
@@ -157,10 +154,8 @@ class ContactColumns:
         score = scan.white.log_density - 0.5 * (chi2 + (precision * x**2).sum(axis=1) + occam)
         variance = np.linalg.inv(normal)[:, SIZE, SIZE]
         chi2 = chi2 / max(int(scan.live.sum()), 1) / self._forgiven(scan, electrodes, x)
-        each = zip(
-            *(values.tolist() for values in (electrodes, x[:, SIZE], variance, begin_s, score, chi2)), strict=True
-        )
-        return [Change(*values) for values in each]
+        found = electrodes, x[:, SIZE], variance, begin_s, score, chi2
+        return [Change(*each) for each in zip(*(values.tolist() for values in found), strict=True)]
 
     def _acting(self, scan: Unexplained, electrodes: Indices, begin_s: Array) -> Array:
         """(n, K, 3) columns of changes that act from then on."""
@@ -215,9 +210,10 @@ def _normal(design: Array, precision: Array) -> Array:
     return np.asarray(design.transpose(0, 2, 1) @ design + precision[:, :, None] * np.eye(precision.shape[1]))
 
 
-def gain_onset(scan: Unexplained) -> float:
-    """Since when a step of the gain would explain most, each measurement by itself [s]."""
-    return float(_onsets(scan, np.ones((len(scan.y), 1)))[0])
+def gain_changes(scan: Unexplained) -> list[Change]:
+    """The likeliest steps of the board's gain, before the scan and within it, each measurement by itself."""
+    within_s = float(_onsets(scan, np.ones((len(scan.y), 1)))[0])
+    return [gain_change(scan, since_s) for since_s in (-np.inf, within_s)]
 
 
 def gain_change(scan: Unexplained, begins_s: float) -> Change:

@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement.course import TouchCourse
 from models.measurement.fit import LEAST_MEAN
@@ -21,8 +20,7 @@ from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Obse
 from services.estimation.hypotheses.selection import HypothesisSelection
 from services.estimation.tared import TaredSkin
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
+from services.estimation.values.arrays import Array
 
 
 class FaultIsolation:
@@ -137,9 +135,7 @@ class FaultIsolation:
         return self._faults.explained_by_fault(found, touched, nearby, ask, doubted)
 
     def decide(self, found: Explanation) -> None:
-        """Whether a contact that has changed is a touch on its electrode, once a whole scan is explained with it: one
-        that is new, or that stands by now.
-        """
+        """Whether a contact that changed is a touch on its electrode, once a whole scan is explained with it."""
         skin, faults, touches = self._skin, self._faults, self._touches
         if not (found.answer.holds and self._at.whole) or found.changed:
             return

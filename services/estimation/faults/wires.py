@@ -26,10 +26,7 @@ from models.measurement.response import DiscGrid
 from models.measurement.whitening import Whitening
 from services.estimation.faults.impedance import MOST_LOG
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Mask = NDArray[np.bool_]
+from services.estimation.values.arrays import Array, Indices, Mask
 
 CANDIDATES = 5  # changes that are looked at exactly
 SIDES = ("+", "-")  # by reciprocity a drive multiplexer does to |Z| what the sense multiplexer of its side does
@@ -77,74 +74,63 @@ class WireMaps:
         self._place = np.full((electrodes + 1, electrodes + 1), len(pattern), np.intp)  # K: no value, 0 ohm
         self._place[first, second] = self._place[second, first] = np.arange(len(pattern))
         couples = list(combinations(range(electrodes), 2))
-        self._exchanged = np.array([self._of_exchanged(first, second, couple) for couple in couples])
-        self._joined = np.array([self._place[couple] for couple in couples])
-        between = [self._terms(first, second, np.full_like(first, a), np.full_like(second, b)) for a, b in couples]
-        self._between = np.array(between)
-        stuck = list[WireFault]()
+        self.faults = [WireFault(kind, couple) for kind in (WireKind.EXCHANGED, WireKind.SHORT) for couple in couples]
         for side, bit, value in product(SIDES, range((electrodes - 1).bit_length()), (0, 1)):
             missed = tuple(e for e in range(electrodes) if (e >> bit & 1) != value)
-            stuck.append(WireFault(WireKind.STUCK, missed, side, bit, value))
-        self._routed = np.array([self._of_stuck(first, second, fault) for fault in stuck])
-        self.faults = [WireFault(WireKind.EXCHANGED, couple) for couple in couples]
-        self.faults += [WireFault(WireKind.SHORT, couple) for couple in couples]
-        self.faults += stuck
+            self.faults.append(WireFault(WireKind.STUCK, missed, side, bit, value))
         self.at = {fault: k for k, fault in enumerate(self.faults)}
+        self._terms = np.array([self._terms_of(first, second, fault) for fault in self.faults])  # (N, K, 4)
+        self._shorts = slice(len(couples), 2 * len(couples))
+        self._joined = self._place[tuple(np.transpose(couples))]
 
     def every(self, z0: Array) -> Array:
         """(N, K) |Z| through each of the N faults, of a skin that has z0 (K,) without them."""
-        values = np.append(z0, 0.0)
-        passed = _combined(values, self._between)
-        short = z0 - passed**2 / (z0[self._joined, None] + n.SHORT_OHM)
-        return np.concatenate([values[self._exchanged], short, np.abs(_combined(values, self._routed))])
+        passed = _combined(z0, self._terms)
+        values, shorts = np.abs(passed), self._shorts
+        values[shorts] = z0 - passed[shorts] ** 2 / (z0[self._joined, None] + n.SHORT_OHM)
+        return np.asarray(values)
 
     def order(self, fault: WireFault) -> Indices:
         """(K,) which measurement shows, while two wires are exchanged, what each would show if they were not."""
-        return np.asarray(self._exchanged[self.at[fault]])
+        return np.asarray(self._terms[self.at[fault], :, 0])
 
     def one(self, fault: WireFault, z0: Array) -> WireMap:
         """Raises KeyError for a fault that this pattern cannot tell."""
-        k, couples = self.at[fault], len(self._joined)
-        if k < couples:
-            values, slopes = z0[self._exchanged[k]], np.eye(len(z0))[self._exchanged[k]]
-        elif k < 2 * couples:
-            values, slopes = self._short(k - couples, z0)
+        terms = self._terms[self.at[fault]]
+        passed, slopes = _combined(z0, terms), _slopes(terms)
+        if fault.kind is WireKind.SHORT:
+            joined = self._place[fault.electrodes]
+            ohm = z0[joined] + n.SHORT_OHM
+            values, slopes = z0 - passed**2 / ohm, np.eye(len(z0)) - 2 * (passed / ohm)[:, None] * slopes
+            slopes[:, joined] += (passed / ohm) ** 2
         else:
-            terms = self._routed[k - 2 * couples]
-            signed = _combined(np.append(z0, 0.0), terms)
-            values, slopes = np.abs(signed), _slopes(terms) * np.sign(signed)[:, None]
+            values, slopes = np.abs(passed), slopes * np.sign(passed)[:, None]
         blind = blinded(values[None], z0)[0]
         relative = slopes * z0 / np.where(blind, 1.0, values)[:, None]
         relative[blind] = 0.0
         return WireMap(values, relative, blind)
 
-    def _short(self, k: int, z0: Array) -> tuple[Array, Array]:
-        passed = _combined(np.append(z0, 0.0), self._between[k])
-        joined = self._joined[k]
-        ohm = z0[joined] + n.SHORT_OHM
-        slopes = np.eye(len(z0)) - 2 * (passed / ohm)[:, None] * _slopes(self._between[k])
-        slopes[:, joined] += (passed / ohm) ** 2
-        return z0 - passed**2 / ohm, slopes
-
-    def _of_exchanged(self, first: Indices, second: Indices, couple: tuple[int, int]) -> Indices:
-        wires = np.arange(int(second.max()) + 1)
-        wires[list(couple)] = couple[::-1]
-        return self._place[wires[first], wires[second]]
-
-    def _of_stuck(self, first: Indices, second: Indices, fault: WireFault) -> Indices:
-        """The pair is driven, and sensed, as it is meant, by one of them from another electrode."""
-        column, mask, electrodes = SIDES.index(fault.side), 1 << fault.bit, len(self._place) - 1
-        driven = [first, second]
-        reached = driven[column] | mask if fault.value else driven[column] & ~mask
-        driven[column] = np.minimum(reached, electrodes)  # beyond the last one nothing is connected
-        terms = self._terms(first, second, *driven)
-        terms[driven[column] == electrodes] = len(first)
+    def _terms_of(self, first: Indices, second: Indices, fault: WireFault) -> Indices:
+        """(K, 4) places of z_ps, z_qr, z_pr and z_qs, with which pair p, q a fault senses and with which r, s it drives
+        where first, second is meant; of a short what the pair makes between the two that are joined.
+        """
+        sensed = driven = [first, second]
+        electrodes, cut_off = len(self._place) - 1, np.zeros(len(first), bool)
+        if fault.kind is WireKind.EXCHANGED:
+            wires = np.arange(electrodes)
+            wires[list(fault.electrodes)] = fault.electrodes[::-1]
+            sensed = driven = [wires[first], wires[second]]
+        elif fault.kind is WireKind.SHORT:
+            driven = [np.full_like(first, joined) for joined in fault.electrodes]
+        else:  # one of the two is driven from another electrode, and beyond the last one nothing is connected
+            column, mask = SIDES.index(fault.side), 1 << fault.bit
+            reached = driven[column] | mask if fault.value else driven[column] & ~mask
+            cut_off = reached >= electrodes
+            driven = [*driven[:column], np.minimum(reached, electrodes), *driven[column + 1 :]]
+        (p, q), (r, s), place = sensed, driven, self._place
+        terms = np.stack([place[p, s], place[q, r], place[p, r], place[q, s]], axis=1)
+        terms[cut_off] = len(first)
         return terms
-
-    def _terms(self, p: Indices, q: Indices, r: Indices, s: Indices) -> Indices:
-        """(K, 4) places of z_ps, z_qr, z_pr and z_qs."""
-        place = self._place
-        return np.stack([place[p, s], place[q, r], place[p, r], place[q, s]], axis=1)
 
     def suspicious(self, scan: BoardScan, standing: WireFault | None) -> bool:
         """Whether measurements fell, or failed, as no touch makes them."""
@@ -174,7 +160,9 @@ class WireMaps:
             slopes = np.where(after[:, None], self._slopes_of(which, z0), slopes_before)
             white = Whitening.of(own + slopes @ skin @ slopes.T)
             residual = np.where(after, left[which], left[before])
-            prior = float(np.where(after, log_prior[which], log_prior[before]).sum()) + _log_prior(before, which)
+            prior = float(np.where(after, log_prior[which], log_prior[before]).sum())
+            if which != before:
+                prior += n.LOG_PRIOR_WIRE * ((before > 0) + (which > 0))
             fault = self.faults[which - 1] if which else None
             found.append(WireGuess(fault, onset_s, white.log_likelihood(residual) + prior))
         return sorted(found, key=lambda guess: -guess.score)
@@ -200,8 +188,8 @@ SIGNS: Array = np.array([0.5, 0.5, -0.5, -0.5])
 
 
 def _combined(values: Array, terms: Indices) -> Array:
-    """(..., K) of values (K + 1,) at terms (..., K, 4)."""
-    return np.asarray(values[terms] @ SIGNS)
+    """(..., K) of values (K,) at terms (..., K, 4)."""
+    return np.asarray(np.append(values, 0.0)[terms] @ SIGNS)
 
 
 def _slopes(terms: Indices) -> Array:
@@ -219,9 +207,7 @@ def blinded(values: Array, z0: Array) -> Mask:
 
 
 def open_electrodes(failed: Mask, member: Mask) -> tuple[int, ...]:
-    """Electrodes by which most failed measurements are explained, chosen from the one that explains most on. failed
-    (K,); member (K, E): the measurement uses the electrode.
-    """
+    """Those that explain most of the failed measurements (K,), the worst chosen first; member (K, E): which it uses."""
     left, gone, found = failed.copy(), np.zeros_like(failed), list[int]()
     while left.any():
         share = (member & left[:, None]).sum(axis=0)
@@ -275,8 +261,3 @@ def any_touches(grid: DiscGrid) -> Array:
     double = grid.responses.astype(float)  # a map's slopes make what rounding leaves 1000 times larger
     weighted = double * (TYPICAL_DROP * areas)[:, None]
     return np.asarray(weighted.T @ weighted * (n.MOST_TOUCHES / len(areas)))
-
-
-def _log_prior(before: int, after: int) -> float:
-    """Log prior of a change of state, 0 being sound wires."""
-    return n.LOG_PRIOR_WIRE * ((before > 0) + (after > 0)) if before != after else 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -10,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.measurement.noise import BURST_BLOCK
-from models.measurement.numbers import COURSE_S
+from models.measurement.numbers import COURSE_S, LEAST_TOLD
 from models.measurement.response import DiscGrid
 from models.measurement.touch import LOG_RADIUS, PLACE
 from models.measurement.whitening import Whitening, leave_out
-from services.estimation.hypotheses.innovation import ONSETS, Innovation, Observation, ScoredAnswer
+from services.estimation.hypotheses.innovation import Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
 
 Array = NDArray[np.float64]
@@ -70,7 +69,7 @@ class DiscActions(NamedTuple):
             others = chosen[:k] + chosen[k + 1 :]
             known = self.solved(others, self.gram)
             along = np.maximum(self.along - self.along[others] @ known, 0.0)
-            precision = np.maximum(own - np.sum(self.gram[others] * known, axis=0), 0.02 * own)
+            precision = np.maximum(own - np.sum(self.gram[others] * known, axis=0), float(LEAST_TOLD) * own)
             explains = np.where(self.apart[:, others].all(axis=1), along**2 / precision, 0.0)
             if explains.max() <= 0:
                 return before, np.inf
@@ -96,26 +95,35 @@ class TouchDetector:
         away = np.hypot(*(discs[:, None, PLACE] - discs[:, PLACE]).transpose(2, 0, 1))
         return np.asarray(away > 2 * np.exp(discs[0, LOG_RADIUS]) + n.NEIGHBOURS)
 
-    def best(self, innovation: Innovation, answer: ScoredAnswer, onsets: Sequence[float] = ()) -> Detection:
-        """The disc that would explain most of what an answer leaves. onsets: shares of the scan after which it may have
-        begun. One that acts in the whole scan is so unless that leaves more than its response gets wrong.
+    def best(self, innovation: Innovation, answer: ScoredAnswer) -> Detection:
+        """The disc that would explain most of what an answer leaves, in the whole scan."""
+        return self._since(innovation, answer, -np.inf)
+
+    def beginning(self, innovation: Innovation, answer: ScoredAnswer) -> Detection:
+        """The same of one that may have begun within the scan, before the first value outside its gate: where the best
+        one leaves more than its response gets wrong.
         """
-        weighted_residual = answer.weighted_residual
-        since_s = np.array([-np.inf, *((share - 0.5) * innovation.span_s for share in onsets)])
-        acts = (innovation.times_s[:, None] >= since_s).astype(np.float32)  # (K, n)
-        shares = self._shares(acts, answer.white) if onsets else np.ones((1, 1), np.float32)
-        along = np.maximum(self._grid.responses @ (acts * weighted_residual[:, None].astype(np.float32)), 0)
-        discs = (along**2 / (innovation.information[:, None] * shares)).argmax(axis=0)  # (n,)
-        columns = self._grid.responses[discs].T.astype(float) * acts
-        along = np.maximum(weighted_residual @ columns, 0.0)
-        exact = answer.informations(columns)
-        z2 = along**2 / exact - np.where(since_s > -np.inf, float(n.ONSET_Z2), 0.0)
-        found = zip(z2.tolist(), discs.tolist(), (along / exact).tolist(), since_s.tolist(), strict=True)
-        whole, *begun = (Detection(*each) for each in found)
-        if not begun:
+        whole, instants = self.best(innovation, answer), innovation.instants
+        outside = answer.residual**2 > n.GLANCE_Z2 * np.diag(innovation.covariance)
+        if not outside.any():
             return whole
-        sharper = self._sharper(innovation, answer, max(whole, *begun))
+        instants = instants[: max(1, int((instants <= innovation.times_s[outside].min()).sum()))]
+        began = self._since(innovation, answer, float(instants[-1]))
+        sharper = self._sharper(innovation, answer, max(whole, began), instants)
         return sharper if sharper.z2 > whole.z2 * (1 + 2 * self._wrong) else whole
+
+    def _since(self, innovation: Innovation, answer: ScoredAnswer, since_s: float) -> Detection:
+        """The best disc that acts since an instant."""
+        acts, information = innovation.times_s >= since_s, innovation.information
+        if since_s > -np.inf:
+            information = information * self._share(acts, answer.white)
+        weighted_residual = np.where(acts, answer.weighted_residual, 0.0)
+        along = np.maximum(self._grid.responses @ weighted_residual.astype(np.float32), 0)
+        disc = int((along**2 / information).argmax())
+        column = self._grid.responses[disc] * acts.astype(float)
+        exact = answer.information(column)
+        action = max(float(weighted_residual @ column), 0.0) / exact
+        return Detection(action**2 * exact, disc, action, since_s)
 
     def several(self, innovation: Innovation, since_s: float) -> list[Detection]:
         """Discs that explain a scan together, none of them on another one, all since an instant that is known roughly:
@@ -127,11 +135,16 @@ class TouchDetector:
         y = np.clip(np.where(innovation.live, innovation.y, 0.0), -1.0, 1.0)
         weight = np.exp(-y) * (innovation.times_s >= since_s)  # slopes of the logarithm, once all is explained
         white = Whitening.of(covariance).w
-        columns, target = (white * weight).astype(np.float32) @ self._grid.responses.T, white @ (1 - np.exp(-y))
-        energy, own = float(target @ target), np.sum(columns**2, axis=0) + n.TINY
-        one = energy - float((np.maximum(target @ columns, 0.0) ** 2 / own).max())
-        if one < max(n.GRID_MISSES * energy, n.GOOD * int(innovation.live.sum())):
-            return []
+        weighted, target = (white * weight).astype(np.float32), white @ (1 - np.exp(-y))
+        energy, responses = float(target @ target), self._grid.responses
+        along = np.maximum(responses @ (weighted.T @ target.astype(np.float32)), 0.0)
+        likely = int((along**2 / (self._squares @ np.sum(weighted**2, axis=0))).argmax())
+        for discs in (responses[[likely]], responses):  # one is enough where one touches, and all take a millisecond
+            columns = weighted @ discs.T
+            own = np.sum(columns**2, axis=0) + n.TINY
+            one = energy - float((np.maximum(target @ columns, 0.0) ** 2 / own).max())
+            if one < max(n.GRID_MISSES * energy, n.GOOD * int(innovation.live.sum())):
+                return []
         columns = columns[:, self._small].astype(float)
         actions = DiscActions(columns.T @ columns, columns.T @ target, energy, self._apart)
         if not (pairs := actions.pairs()):
@@ -144,26 +157,21 @@ class TouchDetector:
         each = zip(self._small[chosen].tolist(), actions.solved(chosen, actions.along).tolist(), strict=True)
         return [Detection(np.inf, disc, action, since_s) for disc, action in each]
 
-    def _sharper(self, innovation: Innovation, answer: ScoredAnswer, best: Detection) -> Detection:
+    def _sharper(self, innovation: Innovation, answer: ScoredAnswer, best: Detection, instants: Array) -> Detection:
         """The same disc since the likeliest instant: a strong touch tells it to a measurement or two, and must."""
-        instants = innovation.instants
         column = self._grid.responses[best.disc].astype(float)
         columns = column[:, None] * (innovation.times_s[:, None] >= instants)
         along, exact = np.maximum(columns.T @ answer.weighted_residual, 0.0), answer.informations(columns)
-        more = 2 * np.log(len(instants) / len(ONSETS))  # so many were tried
-        z2 = along**2 / np.maximum(exact, n.TINY) - n.ONSET_Z2 - more
+        z2 = along**2 / np.maximum(exact, n.TINY) - 2 * np.log(len(instants))  # so many were tried
         k = int(z2.argmax())
         if z2[k] <= best.z2:
             return best
         return Detection(float(z2[k]), best.disc, float(along[k] / exact[k]), float(instants[k]))
 
-    def _shares(self, acts: NDArray[np.float32], white: Whitening) -> NDArray[np.float32]:
-        """(A, n) share of each disc's information in the values in which it acts (K, n); the first acts in all."""
+    def _share(self, acts: NDArray[np.bool_], white: Whitening) -> NDArray[np.float32]:
+        """(A,) share of each disc's information in the values (K,) in which it acts."""
         precision = white.conditional_precisions().astype(np.float32)
-        information = self._squares @ (precision[:, None] * acts)
-        shares = information / information[:, :1] + np.float32(1e-3)
-        shares[:, 0] = 1.0
-        return np.asarray(shares)
+        return np.asarray((self._squares @ (precision * acts)) / (self._squares @ precision) + np.float32(1e-3))
 
 
 def newest_z2(measured: Observation, white: Whitening, weighted_residual: Array) -> float:

@@ -31,7 +31,6 @@ from services.estimation.hypotheses.innovation import (
     LOG_PRIORS,
     MEMORY,
     NOISE,
-    ONSETS,
     Innovation,
     Priors,
     ScoredAnswer,
@@ -444,8 +443,7 @@ class Hypotheses:
         """The likeliest one in what others leave; None where it would not be seen, or may not be looked for."""
         if discs.count >= n.MOST_TOUCHES or innovation.spent or (discs.explained and not innovation.whole):
             return None
-        # None where all values are of one instant.
-        found = self.detector.best(innovation, discs, ONSETS if np.ptp(innovation.times_s) > 0 else ())
+        found = self.detector.beginning(innovation, discs)
         if found.z2 < (n.ANOTHER_Z2 if innovation.whole else n.FALSE_ALARM_Z2):
             return None
         return self._begun(innovation, found)

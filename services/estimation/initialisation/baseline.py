@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, NamedTuple
 
@@ -31,8 +32,6 @@ UNLIKE = 0.12  # rms relative misfit: columns in another order, another unit or 
 SEE = "see that the skin, the order of columns and the unit are those measured, and that no electrode is open"
 REPEATED = 0.1  # of the values that equal the row before: noise of a third of a step gives 0.65, of 4 steps 0.07
 COARSE = 2e-3  # relative step of |Z|: by 9 bits touches of 1 N are placed 4 to 15 mm off, by 10 bits 2 at most
-
-
 MOST_ROWS = 1024  # of which noise is found: time and memory go with their square
 NEIGHBOURS = 2  # scans that each is compared with: more are less alike, one alone tells less
 
@@ -82,7 +81,7 @@ class Baseline:
         if not (np.isfinite(z0).all() and (z0 >= 0).all() and (sigma > 0).all()):
             raise NoBaseline("the saved baseline has impedances or noises that are not possible: tare again")
         known = int(((z0 > 0) & np.isfinite(sigma)).sum())
-        if known < 0.5 * measurements:
+        if known < numbers.LEAST_LIVE * measurements:
             raise NoBaseline(f"the saved baseline knows only {known} of {measurements} measurements: tare again")
         return cls(z0, sigma, *rest, *provenance)
 
@@ -258,10 +257,7 @@ class References:
     def __init__(self, measurements: int) -> None:
         self._k = measurements
         self.doubt = ""  # what a reader of the whole file says against all of them
-        self.reset()
-
-    def reset(self) -> None:
-        self.now = ReferencesState(np.zeros(self._k))
+        self.now = ReferencesState(np.zeros(measurements))
 
     def interrupted(self) -> None:
         """Another scan than a reference came."""
@@ -275,14 +271,15 @@ class References:
         """
         now, good = self.now, in_proportion(np.log(np.where(amplitude > 0, amplitude, np.nan))[None])
         now.scan = scan
-        if good.sum() < self._k / 2:
+        if good.mean() < numbers.LEAST_LIVE:
             return None
         now.row.append(np.where(good, amplitude, np.nan))
         del now.row[:-MOST_ROWS]
         if now.noise is None or len(now.row) > 1:
             rows = np.array(now.row)
             now.noise = noise_of_references(rows)
-            now.typical = np.nan_to_num(_quietly(lambda scans: np.nanmedian(scans, axis=0), rows))
+            with quiet():
+                now.typical = np.nan_to_num(np.nanmedian(rows, axis=0))
         z0, sigma = np.where(good, amplitude, 0.0), np.where(good, now.noise * amplitude, np.inf)
         off = unlike(z0, sigma, pre)
         doubt = f"the reference is {off}: {SEE}" if off else self.doubt
@@ -300,6 +297,15 @@ class References:
         self.now = loaded(ReferencesState, state, {"K": self._k})
 
 
+@contextmanager
+def quiet() -> Iterator[None]:
+    """numpy warns of columns without a value: they are looked after."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        yield
+
+
+@quiet()
 def forms(scans: Array) -> Array:
     """(N, K) |Z| -> how each scan differs from the median one, as logarithms, less what all measurements do together
     (gain); 0 where nothing was measured.
@@ -315,11 +321,12 @@ def alike(scans: Array, count: int) -> NDArray[np.intp]:
     """Which `count` of the scans (N, K) are most alike, in ascending order."""
     if len(scans) <= count:
         return np.arange(len(scans))
-    form = _quietly(forms, scans)
+    form = forms(scans)
     middle = form[np.abs(form).sum(axis=1).argmin()]
     return np.sort(np.argsort(((form - middle) ** 2).sum(axis=1), kind="stable")[:count])
 
 
+@quiet()
 def noise_of_references(reference: Array) -> Array:
     """(K,) relative noise of one scan, from (N, K) |Z| of the untouched skin, in any order; NaN: not measured.
 
@@ -328,10 +335,6 @@ def noise_of_references(reference: Array) -> Array:
     that is asked for would find too little of it. Gain is left out, and medians let outliers count little. Where all
     are the same scan, `TARE_ASSUMED`.
     """
-    return _quietly(_noise, reference)
-
-
-def _noise(reference: Array) -> Array:
     measured = np.where(np.isfinite(reference) & (reference > 0), reference, 0.0)
     rows = np.unique(measured, axis=0)  # a scan that stands there twice says nothing of noise
     rows = rows[:: -(-len(rows) // MOST_ROWS)]
@@ -357,10 +360,3 @@ def _nearest(points: Array, count: int) -> NDArray[np.intp]:
     distance = square[:, None] + square - 2 * points @ points.T
     np.fill_diagonal(distance, np.inf)
     return np.argsort(distance, axis=1, kind="stable")[:, :count]
-
-
-def _quietly(function: Callable[[Array], Array], scans: Array) -> Array:
-    """numpy warns of columns without a value: they are looked after."""
-    with np.errstate(all="ignore"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return function(np.asarray(scans, dtype=float))

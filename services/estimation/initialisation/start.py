@@ -33,7 +33,7 @@ from services.estimation.values.estimate import Judgement, Verdict, judge
 
 Array = NDArray[np.float64]
 
-LADDER: Array = 2.0 ** np.arange(n.START_RUNGS)  # of the difference between bundle and skin
+SIZES: Array = 2.0 ** np.arange(n.START_SIZES)  # of the difference between bundle and skin
 ANY_GAIN = 1.0  # variance of the log of an unknown board's gain
 COARSE = 12  # pixels along each side of the sheet, that a smooth field is made of
 SPAN_S = 1.0  # of a mean of scans, in which nothing changes: any
@@ -46,11 +46,10 @@ class StartSays(Enum):
     UNKNOWN = "unknown"  # the difference between bundle and skin may hide a touch
 
 
-class Rung(NamedTuple):
+class SizedDifference(NamedTuple):
     """The scans with a difference of one size."""
 
-    times: float  # of the least difference
-    even: bool  # whether the sheet is as even as the bundle's
+    sure: bool  # so small, of a sheet as even as the bundle's, that a touch beside it is one
     untouched: float  # log evidence and prior
     touched: float
     seen: float  # z^2 of the weakest touch that must not hide in the difference
@@ -64,7 +63,7 @@ class JudgedStart:
     says: StartSays
     odds: float  # nat: log evidence of touched against untouched
     sure: bool  # whether a touch explains the scans, not only better than a difference alone
-    bare: Rung | None  # the likeliest of an untouched skin; None: nothing is predicted
+    bare: SizedDifference | None  # the likeliest of an untouched skin; None: nothing is predicted
     fit: FoundTouches | None  # where touched, under the likeliest difference
 
     @property
@@ -87,80 +86,73 @@ class EarlierBaseline:
     covariance: Array  # (K, K) of what has drifted since
 
 
-class TouchAtStartTest:
+def judge_start(
+    tables: SkinTables, log_z: Array, variance: Array, live: NDArray[np.bool_], earlier: EarlierBaseline | None = None
+) -> JudgedStart:
     """The likelihood ratio of a touch and of a skin that differs from its bundle, over the first scans. tables: of its
-    bundle.
+    bundle; log_z (K,): mean of the scans; variance (K,): of that mean; live (K,): what of it counts.
     """
-
-    def __init__(self, tables: SkinTables) -> None:
-        self._tables = tables
-
-    def __call__(
-        self, log_z: Array, variance: Array, live: NDArray[np.bool_], earlier: EarlierBaseline | None = None
-    ) -> JudgedStart:
-        """log_z (K,): mean of the first scans; variance (K,): of that mean; live (K,): what of it counts."""
-        if live.mean() < n.LEAST_LIVE or (earlier is None and not self._tables.predicted):
-            return JudgedStart(StartSays.UNKNOWN, 0.0, False, None, None)
-        log_expected = np.log(self._tables.z0) if earlier is None else earlier.log_z0
-        y = log_z - log_expected
-        gain = float(np.median(y[live]))
-        y = np.where(live, y - gain, 0.0)
-        tables = self._tables.relative_to(np.exp(log_expected + gain))
-        base = np.diag(variance + n.START_ABSOLUTE**2) + ANY_GAIN
-        leave_out(base, live)
-        ladder = StartLadder(tables, y, live)
-        if earlier is not None:
-            return decided(ladder.rungs(base + earlier.covariance, n.START_ABSOLUTE**2 * np.eye(len(y)), 0.0))
-        base += contacts(tables)
-        form, wide = bundle_misfit(tables), uneven(tables, base)
-        return decided(ladder.rungs(base, form, 0.0) + ladder.rungs(wide, form, float(n.START_COST_WIDE)))
+    if live.mean() < n.LEAST_LIVE or (earlier is None and not tables.predicted):
+        return JudgedStart(StartSays.UNKNOWN, 0.0, False, None, None)
+    log_expected = np.log(tables.z0) if earlier is None else earlier.log_z0
+    y = log_z - log_expected
+    gain = float(np.median(y[live]))
+    y = np.where(live, y - gain, 0.0)
+    tables = tables.relative_to(np.exp(log_expected + gain))
+    base = np.diag(variance + n.START_ABSOLUTE**2) + ANY_GAIN
+    leave_out(base, live)
+    if earlier is not None:
+        form = n.START_ABSOLUTE**2 * np.eye(len(y))
+        return decide(weigh_differences(tables, y, live, base + earlier.covariance, form, 0.0))
+    base += contacts(tables)
+    form, wide = bundle_misfit(tables), uneven(tables, base)
+    found = weigh_differences(tables, y, live, base, form, 0.0)
+    return decide(found + weigh_differences(tables, y, live, wide, form, float(n.START_COST_WIDE)))
 
 
-class StartLadder:
-    """One mean of scans, explained with differences of each size."""
+def weigh_differences(
+    tables: SkinTables, y: Array, live: NDArray[np.bool_], base: Array, form: Array, cost: float
+) -> list[SizedDifference]:
+    """One mean of scans y (K,), explained with differences of each size, up to beyond the likeliest of an untouched
+    skin. base (K, K): covariance but for the difference, whose form (K, K) is; cost: of that base, as log prior.
+    """
+    covariances = [base + times**2 * form for times in SIZES]
+    whites = [Whitening.of(covariance) for covariance in covariances]
+    density = [white.log_likelihood(y) for white in whites]
+    course = TouchCourse(tables.response, np.zeros(len(y)), SPAN_S)
+    found = list[SizedDifference]()
+    for k, times in enumerate(SIZES[: int(np.argmax(density)) + 2]):
+        log_prior = cost - float(np.log(times))  # the larger, the less likely
+        information = tables.grid.information(whites[k])
+        least = float(n.START_SEEN**2 * np.quantile(information, n.START_SEEN_SHARE))
+        scene = FittedScan(y, covariances[k], course, tables.misfit, int(live.sum()))
+        fit = search_touches(scene, tables, whites[k], information)
+        touched = -np.inf if fit is None else fit.evidence + n.LOG_PRIOR_TOUCH * len(fit) + log_prior
+        sure = cost == 0 and bool(times <= n.START_SURE)
+        found.append(SizedDifference(sure, density[k] + log_prior, touched, least, fit))
+    return found
 
-    def __init__(self, tables: SkinTables, y: Array, live: NDArray[np.bool_]) -> None:
-        self._y, self._live = y, live
-        self._grid = tables.grid
-        self._course = TouchCourse(tables.response, np.zeros(len(y)), SPAN_S)
-        self._misfit, self._error = tables.misfit, tables.wrong
 
-    def rungs(self, base: Array, form: Array, cost: float) -> list[Rung]:
-        """base (K, K): covariance but for the difference, whose form (K, K) is. Up to beyond the likeliest of an
-        untouched skin.
-        """
-        covariances = [base + times**2 * form for times in LADDER]
-        whites = [Whitening.of(covariance) for covariance in covariances]
-        density = [white.log_likelihood(self._y) for white in whites]
-        found = list[Rung]()
-        for k, times in enumerate(LADDER[: int(np.argmax(density)) + 2]):
-            log_prior = cost - float(np.log(times))  # the larger, the less likely
-            information = self._grid.information(whites[k])
-            least = float(n.START_SEEN**2 * np.quantile(information, n.START_SEEN_SHARE))
-            scene = FittedScan(self._y, covariances[k], self._course, self._misfit, int(self._live.sum()))
-            fit = self._touched(scene, whites[k], information)
-            touched = -np.inf if fit is None else fit.evidence + n.LOG_PRIOR_TOUCH * len(fit) + log_prior
-            found.append(Rung(float(times), cost == 0, density[k] + log_prior, touched, least, fit))
-        return found
-
-    def _touched(self, scene: FittedScan, white: Whitening, information: NDArray[np.float32]) -> FoundTouches | None:
-        """Touches one after the other, each found as a disc, while they add evidence."""
-        weighted_residual = white.solve(self._y)
-        best: FoundTouches | None = None
-        priors = list[TouchPrior]()
-        for _ in range(int(n.START_TOUCHES)):
-            z2, disc, action = self._grid.likeliest(weighted_residual, information)
-            if z2 < n.FALSE_ALARM_Z2:
-                break
-            x, y = self._grid.discs[disc, PLACE]
-            prior = anywhere(float(x), float(y), action, SPAN_S)
-            prior.sd[RATE:] = STEADY_SD
-            priors = [*priors, prior]
-            fit = TouchFitter(scene, priors, self._error).fit(int(n.STEPS_COLD))
-            if best is not None and fit.evidence < best.evidence + n.ANOTHER:
-                break
-            best, weighted_residual = fit, fit.weighted_residual
-        return best
+def search_touches(
+    scene: FittedScan, tables: SkinTables, white: Whitening, information: NDArray[np.float32]
+) -> FoundTouches | None:
+    """Touches one after the other, each found as a disc, while they add evidence."""
+    weighted_residual = white.solve(scene.y)
+    best: FoundTouches | None = None
+    priors = list[TouchPrior]()
+    for _ in range(int(n.START_TOUCHES)):
+        z2, disc, action = tables.grid.likeliest(weighted_residual, information)
+        if z2 < n.FALSE_ALARM_Z2:
+            break
+        x, y = tables.grid.discs[disc, PLACE]
+        prior = anywhere(float(x), float(y), action, SPAN_S)
+        prior.sd[RATE:] = STEADY_SD
+        priors.append(prior)
+        fit = TouchFitter(scene, priors, tables.wrong).fit(int(n.STEPS_COLD))
+        if best is not None and fit.evidence < best.evidence + n.ANOTHER:
+            break
+        best, weighted_residual = fit, fit.weighted_residual
+    return best
 
 
 def contacts(tables: SkinTables) -> Array:
@@ -181,7 +173,7 @@ def uneven(tables: SkinTables, even: Array) -> Array:
     smoothed = np.einsum("ab,bck->ack", near, np.einsum("cd,bdk->bck", near, coarse))
     grain = np.stack([tables.along.sum(axis=(0, 1)), tables.turned.sum(axis=(0, 1))], axis=1).astype(float)
     field = np.einsum("yxk,yxl->kl", coarse, smoothed, optimize=True)
-    return np.asarray(even + n.START_FIELD**2 * field + n.START_GRAIN**2 * (grain @ grain.T))
+    return np.asarray(even + n.START_FIELD**2 * field + n.START_FIELD**2 * (grain @ grain.T))
 
 
 def bundle_misfit(tables: SkinTables) -> Array:
@@ -190,15 +182,14 @@ def bundle_misfit(tables: SkinTables) -> Array:
     return np.asarray(series + n.START_ABSOLUTE**2 * np.eye(len(series)))
 
 
-def decided(rungs: list[Rung]) -> JudgedStart:
-    untouched = np.array([rung.untouched for rung in rungs])
-    touched = np.array([rung.touched for rung in rungs])
+def decide(differences: list[SizedDifference]) -> JudgedStart:
+    untouched = np.array([each.untouched for each in differences])
+    touched = np.array([each.touched for each in differences])
     odds = float(np.logaddexp.reduce(touched)) - float(np.logaddexp.reduce(untouched))
-    bare = rungs[int(untouched.argmax())]
-    best = rungs[int(touched.argmax())]
+    bare = differences[int(untouched.argmax())]
+    best = differences[int(touched.argmax())]
     if odds > n.START_NATS and best.fit is not None:
-        sure = best.even and best.times <= n.START_SURE
-        return JudgedStart(StartSays.TOUCHED, odds, sure, bare, best.fit)
+        return JudgedStart(StartSays.TOUCHED, odds, best.sure, bare, best.fit)
     says = StartSays.UNTOUCHED if odds < 0 and bare.seen > n.FALSE_ALARM_Z2 else StartSays.UNKNOWN
     return JudgedStart(says, odds, False, bare, None)
 
@@ -215,7 +206,7 @@ class WiringTest:
         tables = self._tables
         base = uneven(tables, contacts(tables) + ANY_GAIN + any_touches(tables.grid))
         form = bundle_misfit(tables)
-        return [base + times**2 * form for times in LADDER]
+        return [base + times**2 * form for times in SIZES]
 
     def __call__(self, log_z: Array, variance: Array, live: NDArray[np.bool_]) -> WireFault | None:
         """log_z (K,): mean of the first scans; variance (K,): of that mean; live (K,): what of it counts."""
@@ -229,7 +220,7 @@ class WiringTest:
             return None
         own = np.diag(np.where(live, variance, 1.0))
         best = dict[WireFault | None, float]()
-        for times, covariance in zip(LADDER, self._covariances, strict=True):
+        for times, covariance in zip(SIZES, self._covariances, strict=True):
             for guess in self.maps.guesses(scan, None, covariance, own):
                 score = guess.score - float(np.log(times))
                 best[guess.fault] = max(best.get(guess.fault, -np.inf), score)

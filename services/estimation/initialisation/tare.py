@@ -5,7 +5,6 @@ nothing touches. The first is taken as soon as that holds, others by the command
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -16,13 +15,7 @@ from models.measurement.tables import FIELD_DEGREES, SkinTables
 from models.prereconstruction import shrunk
 from services.estimation.faults.wires import WireFault, WireKind
 from services.estimation.initialisation.baseline import NoBaseline, agreement, identical, measured, untrained
-from services.estimation.initialisation.start import (
-    EarlierBaseline,
-    JudgedStart,
-    StartSays,
-    TouchAtStartTest,
-    WiringTest,
-)
+from services.estimation.initialisation.start import EarlierBaseline, JudgedStart, StartSays, WiringTest, judge_start
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Judgement, judge
 from services.estimation.values.scan import Scan
@@ -36,14 +29,6 @@ UNSURE = (
     "once"
 )
 PRESSED = "something touches the skin, and has since the start: free it; if nothing touches it, run `skin tare{}`"
-
-
-class BaselineTells(Enum):
-    """What a baseline's word is worth to a command: TOUCHES is believed, LOST explains the skin no more."""
-
-    NOTHING = "nothing"
-    TOUCHES = "touches"
-    LOST = "lost"
 
 
 class AgreedScans(NamedTuple):
@@ -61,8 +46,7 @@ class AgreedScans(NamedTuple):
     def scatter(self) -> Array:
         """(K,) standard deviation from scan to scan: each measurement's own and that of all, as few scans tell it."""
         own = self.residuals.var(axis=0, ddof=1)
-        pooled = float(np.median(own[self.live])) if self.live.any() else 0.0
-        variance = shrunk(own, pooled, len(self.residuals))
+        variance = shrunk(own, float(np.median(own[self.live])), len(self.residuals))
         return np.asarray(np.sqrt(np.maximum(variance, max(self.least_white, LEAST_NOISE**2))))
 
 
@@ -81,7 +65,7 @@ class LatestScansState:
 class LatestScans:
     """Scans that follow each other."""
 
-    def __init__(self, needed: int = int(n.TARE_SCANS)) -> None:
+    def __init__(self, needed: int) -> None:
         """needed: scans of a baseline."""
         self.now, self.needed = LatestScansState(), needed
 
@@ -190,7 +174,7 @@ class TaringState:
 class Taring:
     """Of one skin; tables: of its bundle."""
 
-    def __init__(self, tables: SkinTables, needed: int = int(n.TARE_SCANS)) -> None:
+    def __init__(self, tables: SkinTables, needed: int) -> None:
         """needed: scans of a baseline."""
         self.latest, self.now = LatestScans(needed), TaringState()
         self.use(tables)
@@ -198,7 +182,7 @@ class Taring:
     def use(self, tables: SkinTables) -> None:
         """Of the same skin, known better: what its scans were judged by is another one."""
         self.now.pressed = None
-        self._tables, self._start, self._wires = tables, TouchAtStartTest(tables), WiringTest(tables)
+        self._tables, self._wires = tables, WiringTest(tables)
 
     def offer(self, scan: Scan, live: NDArray[np.bool_], middle_s: float) -> None:
         """A whole scan; live (K,): what of it was measured; middle_s: when. One that is not believed interrupts."""
@@ -255,14 +239,17 @@ class Taring:
 
     def _judged(self, scans: AgreedScans, earlier: EarlierBaseline | None) -> JudgedStart:
         variance = (scans.residuals**2).mean(axis=0) / len(scans.residuals)
-        return self._start(scans.log_z0, variance, scans.live, earlier)
+        return judge_start(self._tables, scans.log_z0, variance, scans.live, earlier)
 
-    def by_command(self, force: bool, tells: BaselineTells) -> AgreedScans:
-        """The latest scans, whatever the baseline was. Raises NoBaseline, while something touches unless forced."""
+    def by_command(self, force: bool, unexplained_s: float | None) -> AgreedScans:
+        """The latest scans, whatever the baseline was. Raises NoBaseline, while something touches unless forced.
+        unexplained_s: for which the baseline has not explained the skin; None: there is none.
+        """
         now, needed = self.now, self.latest.needed
         if now.surely and not force:
             raise NoBaseline(PRESSED.format(" --force"))
-        believed = tells is BaselineTells.TOUCHES and not now.doubted
+        lost = unexplained_s is not None and unexplained_s > n.LOST_S
+        believed = unexplained_s is not None and not lost and not now.doubted
         if believed and not force and len(self.latest) == needed:
             if now.touched:
                 raise NoBaseline("the skin is touched: free it and try again (or --force, if nothing touches it)")
@@ -270,7 +257,7 @@ class Taring:
                 few = f"only {now.untouched} of {needed} untouched frames since the last touch"
                 raise NoBaseline(f"{few}: wait and try again")
         scans = self.latest.agreed(self._tables)
-        if tells is BaselineTells.LOST and not force and self._judged(scans, None).sure:
+        if lost and not force and self._judged(scans, None).sure:
             raise NoBaseline(PRESSED.format(" --force"))
         # Whoever gives the command has looked: no doubt, but that of noise, which looking does not mend.
         now.judgements = tuple(each for each in scans.judgements if each.name != "identical")

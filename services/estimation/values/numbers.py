@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START, LEARNING, SIGMAS, TINY, WHITE, Number
+from models.measurement import numbers as measurement
+from models.measurement.numbers import CONTACT_START, FALSE_ALARM_Z2, FIELD_START, SIGMAS, TINY, WHITE, Number
 
 __all__ = ["CONTACT_START", "FALSE_ALARM_Z2", "FIELD_START", "SIGMAS", "TINY", "WHITE"]  # beside this module's own
 
@@ -17,19 +18,19 @@ MOST = Number(2.5, "-", "the same of a fit that is roughly right: places hold", 
 FIELD_WALK = Number(1e-5, "1/sqrt(s)", "log conductivity, even: its walk", "measured: drift of 4 %/min, 459 phantoms")
 SLOPE_WALK = Number(3e-6, "1/sqrt(s)", "the same across the sheet", "derived: a third of FIELD_WALK")
 FIELD_RATE = Number(2e-4, "1/s", "log conductivity, even: its rate at the tare", "derived: half a degree a minute")
-SLOPE_RATE = Number(1e-4, "1/s", "the same across the sheet", "derived: half of FIELD_RATE")
+SLOPE_RATE = 0.5 * FIELD_RATE  # 1/s: the same across the sheet
 SLOPE_LASTS_S = Number(20.0, "s", "for which it goes on one way, unwatched", "derived: heat through 1 cm of foam")
 FIELD_RATE_WALK = Number(2e-5, "1/s/sqrt(s)", "its walk", "measured: half a degree a minute is followed in 3 s")
 SLOPE_RATE_WALK = Number(8e-6, "1/s/sqrt(s)", "the same across the sheet", "derived: 0.4 of FIELD_RATE_WALK")
 FIELD_FASTER = Number(1e-3, "-", "faster drift than that, in one scan", "derived: ten sigmas of one measurement")
-SLOPE_FASTER = Number(5e-4, "-", "the same across the sheet", "derived: half of FIELD_FASTER")
-FASTER_STAYS = LEARNING  # of that variance, in value and rate from then on: 20 such scans
+SLOPE_FASTER = 0.5 * FIELD_FASTER  # the same across the sheet
+FASTER_STAYS = measurement.LEARNING  # of that variance, in value and rate from then on: 20 such scans
 CONTACT_FASTER = Number(2e-3, "-", "faster change of a contact impedance in one scan", "derived: ten of CONTACT_WALK")
 CONTACT_WALK = Number(2e-4, "1/sqrt(s)", "a contact impedance", "measured: drifts of 0.1 to 1 %/s, 0 to 1 phantom")
 CONTACT_RATE = Number(8e-4, "1/s", "the same while nobody watches", "derived: a quarter in 5 minutes; skin.toml's own")
 CONTACT_BENDS = Number(1e-3, "-", "of such a change: what its columns leave", "measured: 4e-4 at 30 %, EIDORS")
 CONTACT_FOLLOWS = Number(0.1, "1/s", "of its flicker's variance that is slow", "measured: 1/f noise of 0.1 %")
-REMAINDER_START = Number(1e-5, "-", "each measurement's own rest at the tare", "derived: 64 frames at 80 dB")
+REMAINDER_START = FIELD_START  # each measurement's own rest at the tare
 REMAINDER_WALK = Number(2e-6, "1/sqrt(s)", "its walk", "chosen: a tenth of the noise in half a minute")
 """What drifts."""
 
@@ -56,21 +57,20 @@ STILL_SCANS = Number(3.0, "-", "scans without motion or change, after which a to
 PLACE_WALK = Number(0.003, "unit", "place of one that stays, from scan to scan", "derived: a third of STILL_WAY")
 STAYS_WITHIN = Number(2.5, "-", "sigmas that one which stays is off at most", "derived: one scan of 25")
 STILL_WAY = Number(0.01, "unit", "way within a scan of one that stays", "derived: 0.5 mm, 12 mm/s")
-STILL_CHANGE = Number(0.1, "-", "change of its action within a scan", "derived: CHANGES")
+STILL_CHANGE = measurement.CHANGES  # of its action within a scan
 RADIUS_WALK = Number(0.05, "-", "log radius from scan to scan", "chosen: a finger that rolls")
 SHAPE_WALK = Number(0.3, "-", "of what shapes differ by, from scan to scan", "chosen: a finger that rolls")
 SLIDES = Number(1.5, "unit/s", "velocity of a touch of which nothing is known", "derived: 75 mm/s, one sigma")
 TURNS = Number(1.0, "unit/s/sqrt(s)", "its walk", "chosen: one that slides turns round in half a second")
-ACTION_WALK = Number(0.05, "-", "of its action, from scan to scan, as it meets another", "derived: as RADIUS_WALK")
+ACTION_WALK = RADIUS_WALK  # of its action, from scan to scan, as it meets another
 MEET_S = Number(2.0, "s", "for which two are kept apart by what they were", "chosen: a second or two of crossing")
 GOES = Number(0.7, "-", "of its action, below which a touch is going", "chosen: above any relaxation")
-ENDED = Number(0.05, "-", "of its greatest action, below which it has ended", "derived: MEMORY_MOST")
+ENDED = MEMORY_MOST  # of its greatest action, below which it has ended
 PLACED = Number(0.06, "unit", "standard deviation of a new touch's place with which it is shown", "derived: 3 mm, near")
 BROAD = Number(0.41, "unit", "radius of a new touch that may as well be two", "derived: 20 mm, 1.5 AREA_LOG_SD up")
-SURE_Z2 = Number(44.0, "-", "z^2 of a new touch that is shown", "derived: FALSE_ALARM_Z2")
+SURE_Z2 = FALSE_ALARM_Z2  # of a new touch that is shown
 """What touches do from scan to scan."""
 
-ONSET_Z2 = Number(7.0, "-", "z^2 that a touch which began within a scan must have beyond", "derived: 2 ln of 33 onsets")
 ANOTHER = Number(15.0, "nat", "evidence that a further touch adds in a part", "derived: 650 discs in 1e4 frames, and 2")
 RECOUNT_GAIN = Number(5.0, "nat", "evidence of others than those that stand", "derived: one false in 150 first askings")
 SEVERAL = Number(0.35, "-", "of what fewer discs leave: one more leaves less", "chosen: three tips, seeds 5, 11; 21")
@@ -97,9 +97,8 @@ ADRIFT = Number(1.5, "-", "by which faster drift grows with each unexplained sca
 MOST_ADRIFT = Number(1e4, "-", "at most, of its variance", "derived: ten per cent of the field")
 """What may explain a scan: log priors, and the budget."""
 
-START_RUNGS = Number(9.0, "-", "sizes of a difference between skin and bundle", "derived: up to 256 times the least")
-START_FIELD = Number(0.05, "-", "log conductivity of an unknown sheet, even over 1 unit", "chosen: sheets dry by 5 %")
-START_GRAIN = Number(0.05, "-", "by which it conducts better one way", "derived: as START_FIELD")
+START_SIZES = Number(9.0, "-", "sizes of a difference between skin and bundle", "derived: up to 256 times the least")
+START_FIELD = Number(0.05, "-", "log conductivity of an unknown sheet: over 1 unit, one way", "chosen: dries by 5 %")
 START_CONTACT = Number(0.3, "-", "a contact impedance of an unknown skin", "derived: as the networks were trained")
 START_SERIES = Number(0.03, "-", "a contact's part in series, against its rest", "measured: trust --plan drift")
 START_ABSOLUTE = Number(3e-5, "-", "what no model of |Z| gets right", "measured: two meshes of one skin")
@@ -115,7 +114,7 @@ TARE_SCANS = Number(64.0, "-", "scans of a baseline", "derived: an eighth of one
 TARE_RETRIES = Number(8.0, "-", "scans after which a first baseline is tried again", "chosen: cost")
 TARE_QUARTERS = Number(4.0, "-", "parts of them that must agree", "chosen: a press of a second is one")
 TARE_DISAGREES = Number(1e-5, "-", "probability that quiet scans are refused", "chosen: once in a year of starts")
-TARE_HARMLESS = Number(5e-5, "-", "change within them that does no harm", "derived: half of one scan's noise")
+TARE_HARMLESS = 0.5 * WHITE  # change within them that does no harm
 TARE_NOISY = Number(0.05, "-", "noise beyond which no touch could be told", "chosen: the weakest touches' change")
 TARE_UNTRAINED = Number(0.0056, "-", "noise beyond which no network was trained", "derived: 45 dB, models/augmentation")
 TARE_DRIFTS = Number(3e-3, "-", "log conductivity, change while they come", "derived: a degree in 3 s")
@@ -193,10 +192,10 @@ GAIN_BACK = Number(0.01, "-", "log of what is left of it when it ends", "derived
 CONTACT_UNSURE = Number(0.02, "-", "of a contact that has just changed, of itself", "derived: a fifth of its walk")
 ON_ELECTRODE = Number(0.2, "unit", "gap below which a touch changes an electrode's contact", "derived: its width")
 ACTS_Z2 = SIGMAS**2  # squared sigmas of a touch's action, below which it may be none
-SMALL = Number(0.2, "unit", "radius of a touch that may be an electrode's contact", "derived: an electrode's width")
+SMALL = ON_ELECTRODE  # radius of a touch that may be an electrode's contact
 LOG_PRIOR_SMALL = Number(-8.0, "nat", "log prior of such a touch on an electrode", "derived: its share of the sheet")
 COUNT_DOUBTS = (1, 2, 8, 24)  # whole scans of a touch, after which it is asked whether it is several
-CHANGE_ROWS = Number(24.0, "-", "least measurements since a change", "derived: two parts; one is as well a touch")
+CHANGE_ROWS = 2 * measurement.BURST_BLOCK  # least measurements since a change: two parts; one is as well a touch
 STANDS_WAY = Number(0.02, "unit", "way of a touch that stands, in a scan", "derived: 1 mm")
 STANDS_SHARE = Number(0.2, "-", "its change of size and of action", "derived: a finger that presses harder for a scan")
 UNEXPLAINED_SCANS = Number(3.0, "-", "scans after which a fault that explains nothing goes", "measured: six lock-ins")

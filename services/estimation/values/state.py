@@ -10,7 +10,7 @@ import types
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -19,7 +19,6 @@ T = TypeVar("T")
 Sizes = dict[str, int]
 
 GAPS = "gaps"
-PLAIN = {int: (int,), float: (float, int), str: (str,), bool: (bool,)}
 
 
 def saved(state: Any) -> Any:
@@ -42,20 +41,25 @@ def loaded(kind: type[T], found: Any, sizes: Sizes) -> T:
     return _read(kind, found, sizes, kind.__name__)  # type: ignore[no-any-return]
 
 
-def _read(kind: Any, found: Any, sizes: Sizes, where: str) -> Any:
+_hints = cache(partial(get_type_hints, include_extras=True))
+
+
+def _read(kind: Any, found: Any, sizes: Sizes, where: str, dimensions: tuple[str, ...] = ()) -> Any:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        return _array(arguments[0], found, sizes, arguments[1:], where)
+        return _read(arguments[0], found, sizes, where, arguments[1:])
     if origin in (Union, types.UnionType):
         rest = [each for each in arguments if each is not type(None)]
-        return None if found is None else _read(rest[0], found, sizes, where)
+        return None if found is None else _read(rest[0], found, sizes, where, dimensions)
+    if dimensions:
+        return _array(kind, found, sizes, dimensions, where)
     if origin in (list, tuple, dict):
         return _several(origin, arguments, found, sizes, where)
-    if isinstance(kind, type) and issubclass(kind, Enum):
+    if issubclass(kind, Enum):
         return kind(found)
     if is_dataclass(kind) or hasattr(kind, "_fields"):
         return _record(kind, found, dict(sizes), where)
-    if not isinstance(found, PLAIN[kind]) or isinstance(found, bool) != (kind is bool):
+    if not isinstance(found, (float, int) if kind is float else kind) or isinstance(found, bool) != (kind is bool):
         raise _misfit(where, found, kind.__name__)
     return kind(found)
 
@@ -68,13 +72,6 @@ def _record(kind: Any, found: Any, sizes: Sizes, where: str) -> Any:
     else:
         found = dict(zip(hints, _list(found, where, len(hints)), strict=True))
     return kind(*(_read(hint, found[name], sizes, f"{where}.{name}") for name, hint in hints.items()))
-
-
-@cache
-def _hints(kind: Any) -> dict[str, Any]:
-    hints = get_type_hints(kind, include_extras=True)
-    names = [each.name for each in fields(kind)] if is_dataclass(kind) else kind._fields
-    return {name: hints[name] for name in names}
 
 
 def _several(origin: Any, arguments: tuple[Any, ...], found: Any, sizes: Sizes, where: str) -> Any:
@@ -96,10 +93,6 @@ def _list(found: Any, where: str, count: int | None = None) -> list[Any]:
 
 
 def _array(kind: Any, found: Any, sizes: Sizes, dimensions: tuple[str, ...], where: str) -> Any:
-    if get_origin(kind) in (Union, types.UnionType):
-        if found is None:
-            return None
-        kind = next(each for each in get_args(kind) if each is not type(None))
     dtype = get_args(get_args(kind)[1])[0]
     named = [each for each in dimensions if each != GAPS]
     if not isinstance(found, np.ndarray) or found.dtype != dtype or found.ndim != len(named):
