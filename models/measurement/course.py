@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement import numbers as n
+from models.measurement.arrays import Array
 from models.measurement.response import TouchModel
 from models.measurement.touch import ACTION, LOG_RADIUS, RATE, SHAPES, STATES, VX, VY, TouchPrior, X, Y
-
-Array = NDArray[np.float64]
 
 
 def _steps(parts: int) -> Array:

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from models.measurement import numbers as n
+from models.measurement.arrays import Array
 from models.measurement.course import STRENGTH, Kinks, TouchColumns, TouchCourse, places_of
 from models.measurement.touch import (
     ACTION,
@@ -34,8 +34,6 @@ from models.measurement.touch import (
     within_limits,
 )
 from models.measurement.whitening import Whitening
-
-Array = NDArray[np.float64]
 
 LEAST_MEAN = -0.9  # relative change: nothing takes all of an impedance away
 SIZE_CHANGED = 2.5  # times the squared change, or its inverse, beyond which its misfit is taken anew

@@ -21,14 +21,13 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement import numbers as n
+from models.measurement.arrays import Array, Indices
 from models.measurement.tables import SkinTables
 from models.measurement.whitening import Whitening
 
-Array = NDArray[np.float64]
-Order = NDArray[np.intp]
+Order = Indices
 
 BURST_BLOCK = int(n.BURST_BLOCK)
 ROUNDS = 10  # of learning from the frames of a tare

@@ -10,16 +10,13 @@ from copy import copy
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, laplace
 
 from models.locator_arrays import LocatorArrays
 from models.measurement import numbers as n
+from models.measurement.arrays import Array, Mask, Single
 from models.measurement.touch import SHAPES, area_of
 from models.measurement.whitening import Whitening
-
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 CLOSE = 1e-6  # units: nearer to the centre no direction is known
 HARMONICS = range(2, 2 + len(n.HARMONIC_SDS))
@@ -38,7 +35,7 @@ class Covered(NamedTuple):
 class DiscResponse:
     """Relative change of |Z| by a disc of unit action: its strength times its area is 1, whatever its radius."""
 
-    def __init__(self, jacobian: Single, along: Single, turned: Single, inside: NDArray[np.bool_]) -> None:
+    def __init__(self, jacobian: Single, along: Single, turned: Single, inside: Mask) -> None:
         """See models/measurement/tables.py:SkinTables."""
         self._jacobian, self._along, self._turned = jacobian, along, turned
         self._pixel = 2.0 / len(jacobian)
@@ -90,7 +87,7 @@ class DiscResponse:
         begin = min(max(0, int(first) - 1), len(self._axis) - 1)  # one pixel at least, also beyond the sheet
         return slice(begin, max(begin + 1, min(len(self._axis), int(last) + 2)))
 
-    def _sum(self, table: NDArray[np.float32], at: Covered, weights: Array) -> Array:
+    def _sum(self, table: Single, at: Covered, weights: Array) -> Array:
         """(c, K) of weights (c, n, m)."""
         block = table[at.rows, at.columns].reshape(-1, table.shape[2])
         return (weights.reshape(len(weights), -1).astype(np.float32) @ block).astype(float)
@@ -114,7 +111,7 @@ def _disc_below(x: Array, y: Array) -> Array:
     return below
 
 
-def _discs_on(inside: NDArray[np.bool_]) -> Array:
+def _discs_on(inside: Mask) -> Array:
     """(A, 3) of RADII, whose centres are on the skin; inside (F, F): its pixels."""
     found = list[Array]()
     for radius, step in RADII:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from models.bundle import Bundle
 from models.calibration_file import found_by
 from models.measurement import numbers as n
+from models.measurement.arrays import Array, Mask, Single
 from models.measurement.response import DiscGrid, DiscResponse, MeasuredMap, TouchModel
 from models.measurement.touch import area_of
 from models.patterns import incidence
@@ -20,8 +21,6 @@ OF_DROPS = ("jacobian", "along", "turned")  # tables of SkinTables
 MOST_DEGREE = 3
 FIELD_MODES = [(d - j, j) for d in range(MOST_DEGREE + 1) for j in range(d + 1)]
 FIELD_DEGREES = tuple(i + j for i, j in FIELD_MODES)  # of each mode
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class SkinTables:
     series: Array  # (K, E) the part of `contact` that is in series with the sheet, at the electrode's own measurements
     field: Array  # (K, M) per log conductivity of the sheet, in the modes of FIELD_DEGREES
     misfit: Array  # (K, K) covariance of trace 1: the colour of what linear discs get wrong
-    inside: NDArray[np.bool_]  # (F, F) pixels on the skin
+    inside: Mask  # (F, F) pixels on the skin
     z0: Array  # (K,) |Z| that the rows are relative to
     pattern: NDArray[np.int64]  # (K, 4) drive+, drive-, sense+, sense-
     places: Array  # (E, 2) middles of the electrodes

@@ -7,11 +7,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.measurement import numbers as n
-
-Array = NDArray[np.float64]
+from models.measurement.arrays import Array
 
 # Numbers of a disc's state. X, Y: centre at the reference instant [unit]. LOG_RADIUS. ACTION: drop / (1 - drop / 2)
 # times the area [unit^2]: the measurements are linear in it, and tell it best. RATE: of ACTION [unit^2/s]. VX, VY

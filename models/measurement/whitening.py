@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from models.measurement.arrays import Array, Mask
 from models.measurement.numbers import LEFT_OUT
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class Whitening:
         return np.asarray((self.w**2).sum(axis=0))
 
 
-def leave_out(covariance: Array, live: NDArray[np.bool_]) -> None:
+def leave_out(covariance: Array, live: Mask) -> None:
     """Give measurements that do not count no weight; covariance (K, K) is changed."""
     dead = np.flatnonzero(~live)
     covariance[dead, dead] += LEFT_OUT

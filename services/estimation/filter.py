@@ -12,11 +12,11 @@ from typing import Annotated
 import numpy as np
 from scipy.linalg import block_diag
 
+from models.measurement.arrays import Array, Indices
 from models.measurement.fit import FoundTouches
 from models.measurement.tables import FIELD_DEGREES, SkinTables
 from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array, Indices
 
 MODES = len(FIELD_DEGREES)
 FIELD, RATES = slice(0, MODES), slice(MODES, 2 * MODES)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from models.measurement.arrays import Array, Single
 from models.measurement.fit import FoundTouches
 from models.measurement.noise import NoiseModel
 from models.measurement.response import DiscGrid
@@ -15,7 +16,6 @@ from services.estimation.filter import FilterState, SkinFilter
 from services.estimation.hypotheses.detector import newest_z2
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array, Single
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 import numpy as np
 
 from models.bundle import Bundle
+from models.measurement.arrays import Array, Mask, Single
 from models.measurement.numbers import TINY
 from models.prereconstruction import Drift, Operator, PreReconstructor
-from services.estimation.values.arrays import Array, Mask, Single
 from services.estimation.values.numbers import LEAST_LIVE
 from services.estimation.values.state import loaded
 

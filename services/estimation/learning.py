@@ -9,11 +9,11 @@ from typing import Annotated
 
 import numpy as np
 
+from models.measurement.arrays import Array, Mask
 from models.measurement.noise import NoiseModel
 from models.measurement.whitening import Whitening, leave_out
 from services.estimation.filter import Memory, SkinFilter
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array, Mask
 
 
 @dataclass(frozen=True)

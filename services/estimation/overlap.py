@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from models.measurement.arrays import Array
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, X, Y
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array
 
 
 @dataclass

@@ -6,8 +6,8 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.measurement.arrays import Array
 from models.measurement.touch import ACTION, STATES
 from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults import advice
@@ -34,8 +34,6 @@ from services.estimation.track_update import update_tracks
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Estimate, Judgement, TouchEstimate, Verdict, judge
 from services.estimation.values.scan import NANOSECOND, PER_S, Scan
-
-Array = NDArray[np.float64]
 
 
 @dataclass

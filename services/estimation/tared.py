@@ -8,6 +8,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from models.measurement.arrays import Array, Mask, Single
 from models.measurement.noise import LineState, NoiseModel, NoiseState
 from models.measurement.tables import SkinTables
 from models.measurement.whitening import leave_out
@@ -21,7 +22,6 @@ from services.estimation.initialisation.tare import AgreedScans
 from services.estimation.learning import DelayedUpdate, PendingScan, RefusedState, UnexplainedLoad
 from services.estimation.touches import TouchesState, TouchTracks
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array, Mask, Single
 
 
 class KnownBaseline(NamedTuple):

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.measurement.arrays import Array
 from models.measurement.course import SUDDEN_REACH_S
 from models.measurement.fit import FoundTouches
 from models.measurement.response import TouchModel
@@ -17,8 +17,6 @@ from services.estimation.hypotheses.innovation import Observation
 from services.estimation.overlap import TrackMotion, gaps
 from services.estimation.track import TrackedTouch, disc_of, distance, oddness, same_place
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
 
 
 @dataclass

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.measurement.arrays import Array
 from models.measurement.fit import FoundTouches
 from models.measurement.numbers import MOST_WAY
 from models.measurement.touch import (
@@ -37,8 +37,6 @@ from services.estimation.hypotheses.innovation import Observation
 from services.estimation.overlap import TrackMotion
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import TouchEstimate
-
-Array = NDArray[np.float64]
 
 
 @dataclass

@@ -14,6 +14,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.arrays import Array, Mask
 from models.measurement.fit import LEAST_MEAN
 from models.measurement.noise import NoiseModel
 from models.measurement.numbers import SCAN_S
@@ -27,7 +28,6 @@ from services.estimation.faults.wires import BoardScan, WireFault, WireKind, Wir
 from services.estimation.filter import Prediction
 from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array, Mask
 
 Ask = Callable[[Innovation, Change, bool], ScoredAnswer]
 
@@ -447,7 +447,7 @@ class BoardFaults:
             now.doubt.change(before, now.size)
         elif self._impedance < 1 - n.CONTACT_STILL and 0 < before - now.size < n.TARE_JUMPS:  # as no touch makes it
             self._note_jump(before - now.size)
-        now.variance = 2**2 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
+        now.variance = 4 * change.variance + (n.CONTACT_UNSURE * (1 + abs(now.size))) ** 2
         now.still_s, now.still_size, now.back_scans = 0.0, now.size, 0
 
     def _note_gross(self, since_s: float) -> None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from models.measurement.arrays import Array
 from models.measurement.fit import LEAST_MEAN, FoundTouches
 from models.measurement.tables import SkinTables
 from models.measurement.touch import ACTION
@@ -22,7 +23,6 @@ from services.estimation.faults.impedance import Change, Unexplained
 from services.estimation.hypotheses.hypotheses import Hypotheses
 from services.estimation.hypotheses.innovation import AS_IT_IS, MEMORY, Innovation, ScoredAnswer, StepBudget
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array
 
 EVERY = 16  # scans from asking to asking, once those since the change have doubled so often: at 2, 4, 8, 16, 32, 48 ...
 SETTLES = 3  # whole scans in which a change may go on

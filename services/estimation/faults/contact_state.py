@@ -7,8 +7,8 @@ from typing import Annotated
 
 import numpy as np
 
+from models.measurement.arrays import Array
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array
 
 JUMP = 0.3  # of a change that jumped: so much at most was there before, or came later; a press that takes six scans and
 # more has more of both, chosen on presses of 0.1 N on electrodes that take 1 to 20 scans

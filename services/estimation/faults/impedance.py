@@ -16,12 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from models.measurement.arrays import Array, Indices, Mask
 from models.measurement.fit import LEAST_MEAN
 from models.measurement.numbers import SUDDEN_SD
 from models.measurement.tables import SkinTables
 from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array, Indices, Mask
 
 STEPS = 3
 MOST_LOG = float(np.log(n.FAR))  # of an impedance over its prediction: beyond, nothing is told any more

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from models.measurement.arrays import Array
 from models.measurement.course import TouchCourse
 from models.measurement.fit import LEAST_MEAN
 from models.measurement.touch import TouchPrior
@@ -20,7 +21,6 @@ from services.estimation.hypotheses.innovation import AS_IT_IS, Innovation, Obse
 from services.estimation.hypotheses.selection import HypothesisSelection
 from services.estimation.tared import TaredSkin
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array
 
 
 class FaultIsolation:

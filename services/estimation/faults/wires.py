@@ -21,12 +21,12 @@ from itertools import combinations, product
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.arrays import Array, Indices, Mask
 from models.measurement.numbers import TYPICAL_DROP
 from models.measurement.response import DiscGrid
 from models.measurement.whitening import Whitening
 from services.estimation.faults.impedance import MOST_LOG
 from services.estimation.values import numbers as n
-from services.estimation.values.arrays import Array, Indices, Mask
 
 CANDIDATES = 5  # changes that are looked at exactly
 SIDES = ("+", "-")  # by reciprocity a drive multiplexer does to |Z| what the sense multiplexer of its side does

@@ -6,8 +6,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.measurement.arrays import Array, Mask, Single
 from models.measurement.noise import BURST_BLOCK
 from models.measurement.numbers import COURSE_S, LEAST_TOLD
 from models.measurement.response import DiscGrid
@@ -15,8 +15,6 @@ from models.measurement.touch import LOG_RADIUS, PLACE
 from models.measurement.whitening import Whitening, leave_out
 from services.estimation.hypotheses.innovation import Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
 
 MOST_SMALL = 400  # discs of which all pairs are tried: on a map of 2,000 places they would take 0.3 s
 PAIRS = 3  # from which a third disc is looked for; with 1, one in five threes of tips is not found, with 6 as many
@@ -37,7 +35,7 @@ class DiscActions(NamedTuple):
     gram: Array  # (n, n)
     along: Array  # (n,)
     energy: float  # of the scan
-    apart: NDArray[np.bool_]  # (n, n) none on the other one
+    apart: Mask  # (n, n) none on the other one
 
     def solved(self, chosen: list[int], more: Array) -> Array:
         """(t, ...) least squares of those discs to (n, ...)."""
@@ -89,7 +87,7 @@ class TouchDetector:
         self._small = small[:: len(small) // MOST_SMALL + 1]  # (S,) of which several tell most
 
     @cached_property
-    def _apart(self) -> NDArray[np.bool_]:
+    def _apart(self) -> Mask:
         """(S, S) discs that are no neighbours."""
         discs = self._grid.discs[self._small]
         away = np.hypot(*(discs[:, None, PLACE] - discs[:, PLACE]).transpose(2, 0, 1))
@@ -168,7 +166,7 @@ class TouchDetector:
             return best
         return Detection(float(z2[k]), best.disc, float(along[k] / exact[k]), float(instants[k]))
 
-    def _share(self, acts: NDArray[np.bool_], white: Whitening) -> NDArray[np.float32]:
+    def _share(self, acts: Mask, white: Whitening) -> Single:
         """(A,) share of each disc's information in the values (K,) in which it acts."""
         precision = white.conditional_precisions().astype(np.float32)
         return np.asarray((self._squares @ (precision * acts)) / (self._squares @ precision) + np.float32(1e-3))

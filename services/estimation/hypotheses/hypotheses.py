@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations, takewhile
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.measurement.arrays import Array
 from models.measurement.course import SUDDEN_STEPS, TURN_STEPS, TouchCourse
 from models.measurement.fit import LEAST_MEAN, FittedScan, FoundTouches, TouchFitter
 from models.measurement.noise import BURST_BLOCK, NoiseModel, in_blocks
@@ -40,8 +40,6 @@ from services.estimation.hypotheses.innovation import (
 )
 from services.estimation.overlap import apart, neighbours
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
 
 INSIDE, SMALL_RADIUS = 0.03, 0.1  # of an electrode's edge, and of a touch on it, where a search begins [unit]
 RAMPS_S = (AT_ONCE_S, float(SUDDEN_STEPS[-1]), 2 * float(SUDDEN_STEPS[-1]))  # of a touch that ends within a scan

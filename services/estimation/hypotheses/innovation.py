@@ -8,15 +8,14 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.measurement.arrays import Array, Indices, Mask, Single
 from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, PLACE, RATE, VELOCITY, TouchPrior, anywhere
 from models.measurement.whitening import Whitening
 from services.estimation.values import numbers as n
 from services.estimation.values.scan import NANOSECOND, Scan
 
-Array = NDArray[np.float64]
 Priors = Sequence[TouchPrior]
 
 NEWEST = 0.05  # share of a scan's values in which nothing is looked for that begins or ends: the next ones tell
@@ -49,12 +48,12 @@ class Observation:
 
     scan: Scan
     log_z: Array  # (K,) 0 where a measurement does not count
-    live: NDArray[np.bool_]  # (K,)
+    live: Mask  # (K,)
     whole: bool  # it shares no value with the last one that was whole
     budget: StepBudget
 
     @property
-    def fields(self) -> tuple[Scan, Array, NDArray[np.bool_], bool, StepBudget]:
+    def fields(self) -> tuple[Scan, Array, Mask, bool, StepBudget]:
         """What makes an observation, and the first of what makes more of it."""
         return self.scan, self.log_z, self.live, self.whole, self.budget
 
@@ -85,7 +84,7 @@ class Observation:
         return self.span_s / 2 - self.scan.ages_s
 
     @cached_property
-    def order(self) -> NDArray[np.intp]:
+    def order(self) -> Indices:
         """(K,) rank in time, 0 the oldest."""
         return np.argsort(np.argsort(-self.scan.ages_s, kind="stable"), kind="stable")
 
@@ -96,7 +95,7 @@ class Innovation(Observation):
 
     y: Array  # (K,) log |Z| over the prediction; 0 where a measurement does not count
     covariance: Array  # (K, K)
-    information: NDArray[np.float32]  # (A,) of each disc of the grid, roughly
+    information: Single  # (A,) of each disc of the grid, roughly
     candidates: tuple[TouchPrior, ...] = ()  # touches that nearly explained the scan before, or this one
     places: tuple[int, ...] = ()  # of each the tracked one that it continues; -1: it is new
     wide: bool = False  # touches that stand were explained by a response that is wrong by more than it should be

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.measurement.arrays import Array
 from models.measurement.numbers import LINE_SCANS
 from models.measurement.touch import anywhere
 from models.measurement.whitening import Whitening
@@ -28,8 +28,6 @@ from services.estimation.hypotheses.split_merge import SplitMergeTest
 from services.estimation.tared import GridInformation, TaredSkin
 from services.estimation.track import is_broad, oddness
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
 
 
 @dataclass

@@ -10,8 +10,8 @@ from dataclasses import replace
 from itertools import takewhile
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.measurement.arrays import Array
 from models.measurement.fit import FoundTouches
 from models.measurement.touch import ACTION, LOG_RADIUS, PLACE, TouchPrior, anywhere, plain
 from services.estimation.hypotheses.detector import DiscActions
@@ -20,8 +20,6 @@ from services.estimation.hypotheses.innovation import Innovation, Priors, Scored
 from services.estimation.overlap import neighbours
 from services.estimation.track import may_be_several, oddness
 from services.estimation.values import numbers as n
-
-Array = NDArray[np.float64]
 
 HALVED_ANGLES = np.linspace(0, np.pi, 8, endpoint=False)  # along which two discs are tried instead of one
 HALVED_APART = (0.6, 1.0, 1.4)  # how far each lies from its middle, in radii

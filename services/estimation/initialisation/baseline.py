@@ -12,17 +12,15 @@ from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.special import chdtri
 
+from models.measurement.arrays import Array, Indices, Mask
 from models.measurement.numbers import LEAST_NOISE, MEDIAN_DEVIATION
 from models.prereconstruction import PreReconstructor, noise_of_frames, shrunk
 from protocol.errors import EitskinError
 from services.estimation.values import numbers
 from services.estimation.values.state import loaded
-
-Array = NDArray[np.float64]
 
 TAKING = "taking the baseline"  # what the status says until there is one
 OUT_OF_PROPORTION = 1e3  # of a measurement over the median one: pairs of one sheet differ by 10
@@ -111,7 +109,7 @@ def percent(share: float, digits: int = 1) -> str:
     return f"{share:.{digits}%}".replace("%", " %")
 
 
-def measured(log_z: Array) -> tuple[NDArray[np.bool_], float]:
+def measured(log_z: Array) -> tuple[Mask, float]:
     """(K,) which measurements of (N, K) log |Z| every frame has, in some proportion to the others, and their relative
     noise. Raises NoBaseline where those are too few, or scatter by too much.
     """
@@ -218,9 +216,9 @@ def unlike(z0: Array, sigma: Array, pre: PreReconstructor) -> str:
     return f"{percent(misfit)} off what the bundle predicts" if misfit > np.hypot(UNLIKE, noise) else ""
 
 
-def in_proportion(log_z: Array) -> NDArray[np.bool_]:
+def in_proportion(log_z: Array) -> Mask:
     """(K,) which of (N, K) log |Z| may be of impedances of the same sheet, in every row; NaN: not measured."""
-    live: NDArray[np.bool_] = np.asarray(np.isfinite(log_z).all(axis=0))
+    live: Mask = np.asarray(np.isfinite(log_z).all(axis=0))
     if live.any():
         live[live] = (np.abs(log_z[:, live] - np.median(log_z[0, live])) < np.log(OUT_OF_PROPORTION)).all(axis=0)
     return live
@@ -317,7 +315,7 @@ def forms(scans: Array) -> Array:
     return np.where(np.isfinite(logs), logs, 0.0)
 
 
-def alike(scans: Array, count: int) -> NDArray[np.intp]:
+def alike(scans: Array, count: int) -> Indices:
     """Which `count` of the scans (N, K) are most alike, in ascending order."""
     if len(scans) <= count:
         return np.arange(len(scans))
@@ -354,7 +352,7 @@ def noise_of_references(reference: Array) -> Array:
     return np.asarray(np.maximum(np.sqrt(shrunk(own**2, typical**2, n)), LEAST_NOISE))
 
 
-def _nearest(points: Array, count: int) -> NDArray[np.intp]:
+def _nearest(points: Array, count: int) -> Indices:
     """(N, count) of each of the points (N, K) the nearest others."""
     square = (points**2).sum(axis=1)
     distance = square[:, None] + square - 2 * points @ points.T

@@ -20,8 +20,8 @@ from math import gcd
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.measurement.arrays import Array, Mask, Single
 from models.measurement.course import TouchCourse
 from models.measurement.fit import FittedScan, FoundTouches, TouchFitter
 from models.measurement.tables import SkinTables
@@ -30,8 +30,6 @@ from models.measurement.whitening import Whitening, leave_out
 from services.estimation.faults.wires import BoardScan, WireFault, WireMaps, any_touches
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Judgement, Verdict, judge
-
-Array = NDArray[np.float64]
 
 SIZES: Array = 2.0 ** np.arange(n.START_SIZES)  # of the difference between bundle and skin
 ANY_GAIN = 1.0  # variance of the log of an unknown board's gain
@@ -87,7 +85,7 @@ class EarlierBaseline:
 
 
 def judge_start(
-    tables: SkinTables, log_z: Array, variance: Array, live: NDArray[np.bool_], earlier: EarlierBaseline | None = None
+    tables: SkinTables, log_z: Array, variance: Array, live: Mask, earlier: EarlierBaseline | None = None
 ) -> JudgedStart:
     """The likelihood ratio of a touch and of a skin that differs from its bundle, over the first scans. tables: of its
     bundle; log_z (K,): mean of the scans; variance (K,): of that mean; live (K,): what of it counts.
@@ -111,7 +109,7 @@ def judge_start(
 
 
 def weigh_differences(
-    tables: SkinTables, y: Array, live: NDArray[np.bool_], base: Array, form: Array, cost: float
+    tables: SkinTables, y: Array, live: Mask, base: Array, form: Array, cost: float
 ) -> list[SizedDifference]:
     """One mean of scans y (K,), explained with differences of each size, up to beyond the likeliest of an untouched
     skin. base (K, K): covariance but for the difference, whose form (K, K) is; cost: of that base, as log prior.
@@ -133,9 +131,7 @@ def weigh_differences(
     return found
 
 
-def search_touches(
-    scene: FittedScan, tables: SkinTables, white: Whitening, information: NDArray[np.float32]
-) -> FoundTouches | None:
+def search_touches(scene: FittedScan, tables: SkinTables, white: Whitening, information: Single) -> FoundTouches | None:
     """Touches one after the other, each found as a disc, while they add evidence."""
     weighted_residual = white.solve(scene.y)
     best: FoundTouches | None = None
@@ -208,7 +204,7 @@ class WiringTest:
         form = bundle_misfit(tables)
         return [base + times**2 * form for times in SIZES]
 
-    def __call__(self, log_z: Array, variance: Array, live: NDArray[np.bool_]) -> WireFault | None:
+    def __call__(self, log_z: Array, variance: Array, live: Mask) -> WireFault | None:
         """log_z (K,): mean of the first scans; variance (K,): of that mean; live (K,): what of it counts."""
         if not self.maps.knows or not self._tables.predicted or live.mean() < n.LEAST_LIVE:
             return None

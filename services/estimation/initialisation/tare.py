@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.measurement.arrays import Array, Indices, Mask
 from models.measurement.numbers import LEAST_NOISE
 from models.measurement.tables import FIELD_DEGREES, SkinTables
 from models.prereconstruction import shrunk
@@ -19,8 +19,6 @@ from services.estimation.initialisation.start import EarlierBaseline, JudgedStar
 from services.estimation.values import numbers as n
 from services.estimation.values.estimate import Judgement, judge
 from services.estimation.values.scan import Scan
-
-Array = NDArray[np.float64]
 
 WIRED_AFTER = 2  # scans, after which wires are asked first; then every TARE_RETRIES
 
@@ -35,7 +33,7 @@ class AgreedScans(NamedTuple):
     """Scans of an untouched skin."""
 
     log_z0: Array  # (K,) mean; where a measurement failed, what the bundle predicts
-    live: NDArray[np.bool_]  # (K,) measurements that none of the scans lacks: the others count not before the next tare
+    live: Mask  # (K,) measurements that none of the scans lacks: the others count not before the next tare
     residuals: Array  # (n, K) less that and an even trend
     at_s: float  # of the mean
     parts: tuple[int, ...]  # with which each ended
@@ -97,16 +95,16 @@ class LatestScans:
         now = self.now
         return len(self) >= WIRED_AFTER and now.seen % n.TARE_RETRIES == WIRED_AFTER and now.seen != now.wired
 
-    def mean(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def mean(self) -> tuple[Array, Array, Mask]:
         """(K,) log |Z|, 0 where none of the scans has it; (K,) variance of that; (K,) what counts."""
         scans = np.stack(self.now.log_z)
-        live: NDArray[np.bool_] = np.asarray(np.isfinite(scans).all(axis=0))
+        live: Mask = np.asarray(np.isfinite(scans).all(axis=0))
         scans = np.where(live, scans, 0.0)
         together = float(np.median(scans[:, live].var(axis=0, ddof=1))) if live.any() else 0.0
         variance = np.full(len(live), max(together, LEAST_NOISE**2) / len(scans))
         return scans.mean(axis=0), variance, live
 
-    def agreed(self, tables: SkinTables, order: NDArray[np.intp] | None = None) -> AgreedScans:
+    def agreed(self, tables: SkinTables, order: Indices | None = None) -> AgreedScans:
         """Raises NoBaseline where there are too few, or they do not agree. order (K,): the value that each measurement
         would show if no wires were exchanged; None: its own.
         """
@@ -184,7 +182,7 @@ class Taring:
         self.now.pressed = None
         self._tables, self._wires = tables, WiringTest(tables)
 
-    def offer(self, scan: Scan, live: NDArray[np.bool_], middle_s: float) -> None:
+    def offer(self, scan: Scan, live: Mask, middle_s: float) -> None:
         """A whole scan; live (K,): what of it was measured; middle_s: when. One that is not believed interrupts."""
         if not scan.believed:
             self.latest.clear()

@@ -15,9 +15,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.arrays import Array, Mask
 from services.estimation.values.scan import Scan
-
-Array = NDArray[np.float64]
 
 
 class Verdict(Enum):
@@ -135,7 +134,7 @@ class Estimate:
     whole: bool  # it shares no value with the last one that was whole
     touches: tuple[TouchEstimate, ...]
     electrodes: NDArray[np.uint8]  # (E,) protocol.frame_types.ELECTRODE_STATES
-    live: NDArray[np.bool_]  # (K,) measurements that count
+    live: Mask  # (K,) measurements that count
     difference: Array  # (K,) log |Z| / Z0 with drift, contact impedances and memory taken out
     sigma: Array  # (K,) its standard deviation
     judgements: tuple[Judgement, ...]

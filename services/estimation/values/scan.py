@@ -8,10 +8,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from models.measurement.arrays import Array, Mask
 from models.measurement.numbers import SCAN_S
 from protocol.frames import RawFrame, as_sent
-
-Array = NDArray[np.float64]
 
 NANOSECOND, US = 1e-9, 1e-6  # of clocks [s]
 PER_S = 1 / US
@@ -25,7 +24,7 @@ class Scan:
 
     values: Annotated[Array, "K", "gaps"]  # |Z|, ohm or counts
     ages_s: Annotated[Array, "K"]  # by how much each value is older than the newest one's end
-    new: Annotated[NDArray[np.bool_], "K"]  # measured after the scan that was stepped before
+    new: Annotated[Mask, "K"]  # measured after the scan that was stepped before
     status: Annotated[NDArray[np.uint8], "K"]  # bits, protocol.frame_types.STATUS_*
     number: int  # the board's
     part: int  # of a scan in parts: the part measured last, from 1 on; 0: a whole scan
