@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from models.measurement.numbers import COURSE_S, LEAST_TOLD
 from models.measurement.response import DiscGrid
 from models.measurement.touch import LOG_RADIUS, PLACE
 from models.measurement.whitening import Whitening, leave_out
-from services.estimation.hypotheses.innovation import Innovation, Observation, ScoredAnswer
+from services.estimation.hypotheses.innovation import ONSETS, Innovation, Observation, ScoredAnswer
 from services.estimation.values import numbers as n
 
 MOST_SMALL = 400  # discs of which all pairs are tried: on a map of 2,000 places they would take 0.3 s
@@ -93,35 +94,26 @@ class TouchDetector:
         away = np.hypot(*(discs[:, None, PLACE] - discs[:, PLACE]).transpose(2, 0, 1))
         return np.asarray(away > 2 * np.exp(discs[0, LOG_RADIUS]) + n.NEIGHBOURS)
 
-    def best(self, innovation: Innovation, answer: ScoredAnswer) -> Detection:
-        """The disc that would explain most of what an answer leaves, in the whole scan."""
-        return self._since(innovation, answer, -np.inf)
-
-    def beginning(self, innovation: Innovation, answer: ScoredAnswer) -> Detection:
-        """The same of one that may have begun within the scan, before the first value outside its gate: where the best
-        one leaves more than its response gets wrong.
+    def best(self, innovation: Innovation, answer: ScoredAnswer, onsets: Sequence[float] = ()) -> Detection:
+        """The disc that would explain most of what an answer leaves. onsets: shares of the scan after which it may have
+        begun. One that acts in the whole scan is so unless that leaves more than its response gets wrong.
         """
-        whole, instants = self.best(innovation, answer), innovation.instants
-        outside = answer.residual**2 > n.GLANCE_Z2 * np.diag(innovation.covariance)
-        if not outside.any():
+        weighted_residual = answer.weighted_residual
+        since_s = np.array([-np.inf, *((share - 0.5) * innovation.span_s for share in onsets)])
+        acts = (innovation.times_s[:, None] >= since_s).astype(np.float32)  # (K, n)
+        shares = self._shares(acts, answer.white) if onsets else np.ones((1, 1), np.float32)
+        along = np.maximum(self._grid.responses @ (acts * weighted_residual[:, None].astype(np.float32)), 0)
+        discs = (along**2 / (innovation.information[:, None] * shares)).argmax(axis=0)  # (n,)
+        columns = self._grid.responses[discs].T.astype(float) * acts
+        along = np.maximum(weighted_residual @ columns, 0.0)
+        exact = answer.informations(columns)
+        z2 = along**2 / exact - np.where(since_s > -np.inf, float(n.ONSET_Z2), 0.0)
+        found = zip(z2.tolist(), discs.tolist(), (along / exact).tolist(), since_s.tolist(), strict=True)
+        whole, *begun = (Detection(*each) for each in found)
+        if not begun:
             return whole
-        instants = instants[: max(1, int((instants <= innovation.times_s[outside].min()).sum()))]
-        began = self._since(innovation, answer, float(instants[-1]))
-        sharper = self._sharper(innovation, answer, max(whole, began), instants)
+        sharper = self._sharper(innovation, answer, max(whole, *begun))
         return sharper if sharper.z2 > whole.z2 * (1 + 2 * self._wrong) else whole
-
-    def _since(self, innovation: Innovation, answer: ScoredAnswer, since_s: float) -> Detection:
-        """The best disc that acts since an instant."""
-        acts, information = innovation.times_s >= since_s, innovation.information
-        if since_s > -np.inf:
-            information = information * self._share(acts, answer.white)
-        weighted_residual = np.where(acts, answer.weighted_residual, 0.0)
-        along = np.maximum(self._grid.responses @ weighted_residual.astype(np.float32), 0)
-        disc = int((along**2 / information).argmax())
-        column = self._grid.responses[disc] * acts.astype(float)
-        exact = answer.information(column)
-        action = max(float(weighted_residual @ column), 0.0) / exact
-        return Detection(action**2 * exact, disc, action, since_s)
 
     def several(self, innovation: Innovation, since_s: float) -> list[Detection]:
         """Discs that explain a scan together, none of them on another one, all since an instant that is known roughly:
@@ -136,7 +128,7 @@ class TouchDetector:
         weighted, target = (white * weight).astype(np.float32), white @ (1 - np.exp(-y))
         energy, responses = float(target @ target), self._grid.responses
         along = np.maximum(responses @ (weighted.T @ target.astype(np.float32)), 0.0)
-        likely = int((along**2 / (self._squares @ np.sum(weighted**2, axis=0))).argmax())
+        likely = int((along**2 / (self._squares @ np.sum(weighted**2, axis=0) + n.TINY)).argmax())
         for discs in (responses[[likely]], responses):  # one is enough where one touches, and all take a millisecond
             columns = weighted @ discs.T
             own = np.sum(columns**2, axis=0) + n.TINY
@@ -155,21 +147,26 @@ class TouchDetector:
         each = zip(self._small[chosen].tolist(), actions.solved(chosen, actions.along).tolist(), strict=True)
         return [Detection(np.inf, disc, action, since_s) for disc, action in each]
 
-    def _sharper(self, innovation: Innovation, answer: ScoredAnswer, best: Detection, instants: Array) -> Detection:
+    def _sharper(self, innovation: Innovation, answer: ScoredAnswer, best: Detection) -> Detection:
         """The same disc since the likeliest instant: a strong touch tells it to a measurement or two, and must."""
+        instants = innovation.instants
         column = self._grid.responses[best.disc].astype(float)
         columns = column[:, None] * (innovation.times_s[:, None] >= instants)
         along, exact = np.maximum(columns.T @ answer.weighted_residual, 0.0), answer.informations(columns)
-        z2 = along**2 / np.maximum(exact, n.TINY) - 2 * np.log(len(instants))  # so many were tried
+        more = 2 * np.log(len(instants) / len(ONSETS))  # so many were tried
+        z2 = along**2 / np.maximum(exact, n.TINY) - n.ONSET_Z2 - more
         k = int(z2.argmax())
         if z2[k] <= best.z2:
             return best
         return Detection(float(z2[k]), best.disc, float(along[k] / exact[k]), float(instants[k]))
 
-    def _share(self, acts: Mask, white: Whitening) -> Single:
-        """(A,) share of each disc's information in the values (K,) in which it acts."""
+    def _shares(self, acts: Single, white: Whitening) -> Single:
+        """(A, n) share of each disc's information in the values in which it acts (K, n); the first acts in all."""
         precision = white.conditional_precisions().astype(np.float32)
-        return np.asarray((self._squares @ (precision * acts)) / (self._squares @ precision) + np.float32(1e-3))
+        information = self._squares @ (precision[:, None] * acts)
+        shares = information / information[:, :1] + np.float32(1e-3)
+        shares[:, 0] = 1.0
+        return np.asarray(shares)
 
 
 def newest_z2(measured: Observation, white: Whitening, weighted_residual: Array) -> float:

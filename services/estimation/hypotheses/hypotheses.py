@@ -31,6 +31,7 @@ from services.estimation.hypotheses.innovation import (
     LOG_PRIORS,
     MEMORY,
     NOISE,
+    ONSETS,
     Innovation,
     Priors,
     ScoredAnswer,
@@ -435,27 +436,14 @@ class Hypotheses:
         them. None where they are fewer.
         """
         priors = [plain(self._begun(innovation, each)) for each in self.detector.several(innovation, since_s)]
-        if len(priors) < least:
-            return None
-        found = self._without_slight(innovation, self.fitted(innovation, priors, (-1,) * len(priors)))
-        return found if found.count >= least else None
-
-    def _without_slight(self, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
-        """An answer of new discs, or a likelier one without a slight disc: what others leave that are no discs."""
-        others = started(answer.fit)
-        actions = [prior.start[ACTION] for prior in others]
-        slight = int(np.argmin(actions))
-        if not answer.explained or actions[slight] > n.SLIGHT * max(actions):
-            return answer
-        del others[slight]
-        fewer = self.fitted(innovation, others, answer.association[1:])
-        return fewer if fewer.explained and fewer.score > answer.score else answer
+        return self.fitted(innovation, priors, (-1,) * len(priors)) if len(priors) >= least else None
 
     def _next_disc(self, innovation: Innovation, discs: ScoredAnswer) -> TouchPrior | None:
         """The likeliest one in what others leave; None where it would not be seen, or may not be looked for."""
         if discs.count >= n.MOST_TOUCHES or innovation.spent or (discs.explained and not innovation.whole):
             return None
-        found = self.detector.beginning(innovation, discs)
+        # None where all values are of one instant.
+        found = self.detector.best(innovation, discs, ONSETS if np.ptp(innovation.times_s) > 0 else ())
         if found.z2 < (n.ANOTHER_Z2 if innovation.whole else n.FALSE_ALARM_Z2):
             return None
         return self._begun(innovation, found)

@@ -18,7 +18,7 @@ from services.estimation.values.scan import NANOSECOND, Scan
 
 Priors = Sequence[TouchPrior]
 
-NEWEST = 0.05  # share of a scan's values in which nothing is looked for that begins or ends: the next ones tell
+ONSETS = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95)  # shares of a scan after which a disc is looked for that began within it
 AS_IT_IS, DRIFT, MEMORY, BURST, NOISE = "", "drift", "memory", "burst", "noise"
 LOG_PRIORS = {
     AS_IT_IS: 0.0,
@@ -112,9 +112,9 @@ class Innovation(Observation):
 
     @cached_property
     def instants(self) -> Array:
-        """(n,) midway between values: something may begin or end then."""
+        """(n,) midway between values: something may begin or end then. What the last few alone say, the next tell."""
         times_s = np.sort(self.times_s)
-        return np.asarray(times_s[times_s <= (0.5 - NEWEST) * self.span_s] - 0.5 * self.span_s / len(times_s))
+        return np.asarray(times_s[times_s <= (ONSETS[-1] - 0.5) * self.span_s] - 0.5 * self.span_s / len(times_s))
 
     def leaving(self, share: float) -> Innovation:
         """The same, which leaves so much of its steps to the next."""
