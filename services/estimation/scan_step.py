@@ -374,8 +374,10 @@ class ScanStep:
         unexplained = float(np.linalg.norm(answer.residual)) / max(float(np.linalg.norm(innovation.y)), n.TINY)
         lasting = [track for track in now.tracks if track.confirmed and track.acts_at(sample_s, self.measured.end_s)]
         open_ids = [track.id for track in (*now.tracks, *now.dropped) if not track.confirmed]
+        found = [track.estimate(sample_s, self.measured.span_s, unexplained) for track in lasting]
+        told = [self.measured.middle_s + self.measured.times_s >= track.since_s for track in lasting]
         return (
-            *(track.estimate(sample_s, self.measured.span_s, unexplained) for track in lasting),
+            *(each if acts.sum() >= n.TOLD else coasted(each, 0.0) for each, acts in zip(found, told, strict=True)),
             *(coasted(touch, passed_s) for touch in published if touch.id in open_ids),
         )
 

@@ -285,7 +285,7 @@ class TrackedTouch:
 
 
 def coasted(touch: TouchEstimate, passed_s: float) -> TouchEstimate:
-    """One that a scan changed so that nothing explains it, or that may be another one or several by now: that it is
+    """One that a scan changed so that nothing explains it, or that may be several, or another one by now: that it is
     there, where roughly, and not how strongly. passed_s: since that estimate.
     """
     covariance = touch.covariance.copy()

@@ -112,9 +112,13 @@ def test_three_touches_that_come_one_after_the_other_are_counted_again(parts, th
     assert all(min(far_off(contact, touch) for touch in three) < 5e-3 for contact in shown[-1].contacts)
 
 
+NEAR = (-0.0159, -0.0107, 5.1e-3, 1.27), (-0.0103, 0.0232, 5.7e-3, 1.72), (0.0232, -0.0049, 5.4e-3, 1.16)
+ALONG = (-0.0015, 0.0022, 5.9e-3, 2.77), (0.0262, 0.0341, 6.6e-3, 1.59), (0.0082, -0.0302, 6.7e-3, 2.08)
+
+
 @BOTH
-def test_three_tips_that_begin_in_the_same_instant_are_never_one_between_two(parts):
-    places = (-0.0159, -0.0107, 5.1e-3, 1.27), (-0.0103, 0.0232, 5.7e-3, 1.72), (0.0232, -0.0049, 5.4e-3, 1.16)
+@pytest.mark.parametrize("places", [NEAR, ALONG], ids=["near", "along"])
+def test_three_tips_that_begin_in_the_same_instant_are_never_one_between_two(parts, places):
     tips = [pressed("circle", *place) for place in places]
     shown = between_s(run(press(*tips, ramp_s=0.0), FREE_S + 0.3, parts), FREE_S)
     plain = [frame for frame in shown if frame.valid and not {"changing", "coarse"} & set(frame.reasons)]

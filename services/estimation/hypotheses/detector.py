@@ -115,10 +115,10 @@ class TouchDetector:
         sharper = self._sharper(innovation, answer, max(whole, *begun))
         return sharper if sharper.z2 > whole.z2 * (1 + 2 * self._wrong) else whole
 
-    def several(self, innovation: Innovation, since_s: float) -> list[Detection]:
-        """Discs that explain a scan together, none of them on another one, all since an instant that is known roughly:
-        of more each leaves less than SEVERAL of what fewer leave. Empty where they are fewer than two, or one leaves no
-        more than noise, or than the best disc of the grid leaves of one touch.
+    def several(self, innovation: Innovation, since_s: float, least: int) -> list[list[Detection]]:
+        """Two, three and four discs that explain a scan together, none of them on another one, all since an instant
+        that is known roughly. At least so many: with 1, none where one disc is likelier, by what each leaves. None
+        either where one leaves no more than noise, or than the best disc of the grid leaves of one touch.
         """
         covariance = innovation.covariance.copy()
         leave_out(covariance, np.abs(innovation.times_s - since_s) > COURSE_S)
@@ -128,8 +128,8 @@ class TouchDetector:
         weighted, target = (white * weight).astype(np.float32), white @ (1 - np.exp(-y))
         energy, responses = float(target @ target), self._grid.responses
         along = np.maximum(responses @ (weighted.T @ target.astype(np.float32)), 0.0)
-        likely = int((along**2 / (self._squares @ np.sum(weighted**2, axis=0) + n.TINY)).argmax())
-        for discs in (responses[[likely]], responses):  # one is enough where one touches, and all take a millisecond
+        disc = int((along**2 / (self._squares @ np.sum(weighted**2, axis=0) + n.TINY)).argmax())
+        for discs in (responses[[disc]], responses):  # one is enough where one touches, and all take a millisecond
             columns = weighted @ discs.T
             own = np.sum(columns**2, axis=0) + n.TINY
             one = energy - float((np.maximum(target @ columns, 0.0) ** 2 / own).max())
@@ -141,11 +141,13 @@ class TouchDetector:
             return []
         three = min((actions.beside(pair) for pair in pairs), key=lambda each: each[1])
         found = [([-1], one), (pairs[0], actions.left(pairs[0])), three, actions.beside(three[0])]
-        chosen, _ = min(found, key=lambda each: each[1] * n.SEVERAL ** -len(each[0]))
-        if len(chosen) < 2:
+        likely = len(min(found, key=lambda each: each[1] * n.SEVERAL ** -len(each[0]))[0])
+        if max(likely, least) < 2:
             return []
-        each = zip(self._small[chosen].tolist(), actions.solved(chosen, actions.along).tolist(), strict=True)
-        return [Detection(np.inf, disc, action, since_s) for disc, action in each]
+        least = max(least, likely if innovation.whole else 2)  # no part follows that tells more
+        enough = [chosen for chosen, left in found if len(chosen) >= least and left < np.inf]
+        each = [zip(self._small[k].tolist(), actions.solved(k, actions.along).tolist(), strict=True) for k in enough]
+        return [[Detection(np.inf, disc, action, since_s) for disc, action in discs] for discs in each]
 
     def _sharper(self, innovation: Innovation, answer: ScoredAnswer, best: Detection) -> Detection:
         """The same disc since the likeliest instant: a strong touch tells it to a measurement or two, and must."""

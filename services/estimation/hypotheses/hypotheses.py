@@ -431,12 +431,20 @@ class Hypotheses:
             return [one], answer
         return list(begun_as(several.fit, innovation.span_s)), several
 
-    def several(self, innovation: Innovation, since_s: float, least: int = 2) -> ScoredAnswer | None:
+    def several(self, innovation: Innovation, since_s: float, least: int = 1) -> ScoredAnswer | None:
         """So many discs at once, or more, which began at an instant that is known roughly: one alone may lie between
-        them. None where they are fewer.
+        them. None where one is enough.
         """
-        priors = [plain(self._begun(innovation, each)) for each in self.detector.several(innovation, since_s)]
-        return self.fitted(innovation, priors, (-1,) * len(priors)) if len(priors) >= least else None
+        found: ScoredAnswer | None = None
+        for discs in self.detector.several(innovation, since_s, least):
+            priors = [plain(self._begun(innovation, each)) for each in discs]
+            more = self.fitted(innovation, priors, (-1,) * len(priors))
+            if found is not None and more.score < found.score:
+                break
+            found = more
+            if innovation.whole or _settled(innovation, [found]):  # the search of a whole scan goes on from them
+                break
+        return found
 
     def _next_disc(self, innovation: Innovation, discs: ScoredAnswer) -> TouchPrior | None:
         """The likeliest one in what others leave; None where it would not be seen, or may not be looked for."""

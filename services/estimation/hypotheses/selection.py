@@ -23,6 +23,8 @@ from services.estimation.hypotheses.innovation import (
     ScoredAnswer,
     StepBudget,
     begun_as,
+    likeliest,
+    started,
 )
 from services.estimation.hypotheses.split_merge import SplitMergeTest
 from services.estimation.tared import GridInformation, TaredSkin
@@ -125,14 +127,17 @@ class HypothesisSelection:
 
     def _begun_recounted(self, hypotheses: Hypotheses, innovation: Innovation, answer: ScoredAnswer) -> ScoredAnswer:
         """Of a part: an answer, or a likelier one of more discs where all touches have just begun, one odd or broad."""
-        fit, half_s = answer.fit, self.measured.span_s / 2
+        fit, lately_s = answer.fit, 1.5 * self.measured.span_s
         if fit is None or not answer.explained:
             return answer
         odd = any(map(is_broad, fit.states)) or max(map(oddness, fit.shapes)) > n.ODD_OUTLINE
-        if not odd or any(prior.since_s < -half_s or prior.until_s < np.inf for prior in fit.priors):
+        if not odd or any(prior.since_s < -lately_s or prior.until_s < np.inf for prior in fit.priors):
             return answer
         own, begun = self._with_own_steps(innovation), begun_as(fit, innovation.span_s)  # what parts told counts once
         found = hypotheses.several(own, min(prior.since_s for prior in begun), answer.count + 1)
+        if found is not None and found.nearly_holds:
+            priors = started(found.fit, begun_as(found.fit, innovation.span_s))
+            found = likeliest([found, hypotheses.fitted(own, priors, found.association)])
         if found is None or not found.explained:
             return answer
         if found.score <= hypotheses.fitted(own, begun, (-1,) * len(begun)).score + n.RECOUNT_GAIN:

@@ -68,13 +68,14 @@ GOES = Number(0.7, "-", "of its action, below which a touch is going", "chosen: 
 ENDED = MEMORY_MOST  # of its greatest action, below which it has ended
 PLACED = Number(0.06, "unit", "standard deviation of a new touch's place with which it is shown", "derived: 3 mm, near")
 BROAD = Number(0.41, "unit", "radius of a new touch that may as well be two", "derived: 20 mm, 1.5 AREA_LOG_SD up")
+TOLD = Number(20.0, "-", "values since a touch began, below which it may be two", "measured: 14 to 19 told one of two")
 SURE_Z2 = FALSE_ALARM_Z2  # of a new touch that is shown
 """What touches do from scan to scan."""
 
 ONSET_Z2 = Number(7.0, "-", "z^2 that a touch which began within a scan must have beyond", "derived: 2 ln of 33 onsets")
 ANOTHER = Number(15.0, "nat", "evidence that a further touch adds in a part", "derived: 650 discs in 1e4 frames, and 2")
 RECOUNT_GAIN = Number(5.0, "nat", "evidence of others than those that stand", "derived: one false in 150 first askings")
-SEVERAL = Number(0.35, "-", "of what fewer discs leave: one more leaves less", "chosen: three tips, seeds 5, 11; 21")
+SEVERAL = Number(0.35, "-", "of what one disc leaves: each more leaves less", "chosen: three tips, seeds 5, 11; 21")
 GRID_MISSES = Number(0.005, "-", "energy of one disc that the grid leaves", "measured: 0.001 to 0.01 of presses")
 ANOTHER_Z2 = Number(16.0, "-", "z^2 of a further disc that is tried by evidence", "chosen: 4 sigmas; evidence decides")
 WIDE_START = Number(4.1, "nat", "log prior that a new touch's wide start lacks", "derived: places 1.9, actions 2.2")
