@@ -117,8 +117,9 @@ class TouchDetector:
 
     def several(self, innovation: Innovation, since_s: float, least: int) -> list[list[Detection]]:
         """Two, three and four discs that explain a scan together, none of them on another one, all since an instant
-        that is known roughly. At least so many: with 1, none where one disc is likelier, by what each leaves. None
-        either where one leaves no more than noise, or than the best disc of the grid leaves of one touch.
+        that is known roughly. At least so many, in a whole scan as many as leave least, where one more leaves less than
+        SEVERAL of what fewer do; with 1, none where that is one. None either where one leaves no more than noise, or
+        than the best disc of the grid leaves of one touch.
         """
         covariance = innovation.covariance.copy()
         leave_out(covariance, np.abs(innovation.times_s - since_s) > COURSE_S)

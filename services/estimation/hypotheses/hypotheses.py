@@ -432,8 +432,8 @@ class Hypotheses:
         return list(begun_as(several.fit, innovation.span_s)), several
 
     def several(self, innovation: Innovation, since_s: float, least: int = 1) -> ScoredAnswer | None:
-        """So many discs at once, or more, which began at an instant that is known roughly: one alone may lie between
-        them. None where one is enough.
+        """So many discs at once, or the likelier more, which began at an instant that is known roughly: one alone may
+        lie between them. None where one is enough.
         """
         found: ScoredAnswer | None = None
         for discs in self.detector.several(innovation, since_s, least):
